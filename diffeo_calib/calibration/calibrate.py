@@ -148,14 +148,13 @@ def calibrate(
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
-            lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
-            tell more; joint offsets are far from the robot's description; the median residual of a geometric
-            calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
-            although the robot moves; the rows show no errors of the robot; too few poses to
-            select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; rows that follow an axis do not tell its errors from a drift; a
-            length of robot or device is not what it is said to be; wrong rows follow one another; more than 40 % of the
-            rows are outliers; the joint values are rounded and this limits the accuracy.
+            lie in a plane or on a line, or move one joint at a time; joint offsets are far from the robot's
+            description; the median residual of a geometric calibration exceeds 5 % of the markers' spread and no other
+            reading explains it; a column holds one value although the robot moves; the rows show no errors of the
+            robot; too few poses to select scales; leave-one-out errors contradict the scales; during the measurements
+            something moved or drifted, a joint offset or a zero changed; rows that follow an axis do not tell its
+            errors from a drift; a length of robot or device is not what it is said to be; wrong rows follow one
+            another; more than 40 % of the rows are outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)

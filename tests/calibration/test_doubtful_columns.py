@@ -221,7 +221,7 @@ def test_markers_that_are_no_measurements_are_refused() -> None:
     )
     hidden = FIRST.clone()
     hidden[::2] = torch.nan
-    assert [one.proved for one in unmeasured_markers(PAIR.nominal, pair(FIRST, hidden))] == [True]
+    assert [proved for _, _, proved in unmeasured_markers(PAIR.nominal, pair(FIRST, hidden))] == [True]
     for rows in (PAIR_ROWS, PAIR_ROWS.rows(slice(8))):
         assert not list(unmeasured_markers(PAIR.nominal, rows))
 

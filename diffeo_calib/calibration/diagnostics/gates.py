@@ -171,6 +171,3 @@ WRONG_SOCKET_MEDIANS, OTHER_SOCKET_FITS, WRONG_SOCKETS = 8.0, 0.3, 0.25
 # Spread within sockets, in median residuals of measured positions, and in reaches of the robot, above both of which
 # the rows are not those of one robot; coordinates per unknown of base and markers from which residuals are compared.
 OTHER_ROBOT_RESIDUALS, OTHER_ROBOT_SHARE, OVERDETERMINED = 2.5, 1e-3, 2.0
-# Distance of a new place from the plane of the sockets, relative to the largest one from the base; expected error with
-# it, relative to that without, below which it is advised.
-RAISED, WORTHWHILE_PLACE = 0.2, 0.8

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import combinations
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -278,19 +278,10 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
     return None
 
 
-class Unmeasured(NamedTuple):
-    """A marker, what it is in words, and whether that is proved."""
-
-    marker: int
-    words: str
-    proved: bool
-
-
-def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
+def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[tuple[int, str, bool]]:
     """Markers that copy another one, and those that the nominal robot explains although it does not explain others.
 
-    Args:
-        robot: n joints. data: N rows of one set-up.
+    ``data``: rows of one set-up. Yields the number of a marker, what it is in words, and whether that is proved.
     """
     places, turns, size = data.origins, robot.tip_poses(data.q)[..., :3, :3], spread(data.points)
     about = torch.linalg.svdvals((turns - turns[:1]).reshape(-1, 3))  # of turns about one axis the last one is 0
@@ -303,7 +294,7 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         shifted = bool(away.any())
         if not shifted or (turning and float((away - away.median(0).values).abs().max()) < gates.DIGITS_SHARE * size):
             words = f"marker {other} is a copy of marker {marker}" + ", shifted by the same in every row" * shifted
-            yield Unmeasured(other, words, proved=True)
+            yield other, words, True
     tips = data.bodies.tips(data.on or robot.tips[:1] * data.points.shape[1])
     if robot.n < gates.NOMINAL_JOINTS or len(set(tips)) == len(tips):
         return
@@ -317,7 +308,7 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
         explained = gates.DIGITS_SHARE * size < far < gates.RIGHT_READING * size
         if explained and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
-            yield Unmeasured(k, f"{words}: wished places", typical < gates.DIGITS_SHARE * size)
+            yield k, f"{words}: wished places", typical < gates.DIGITS_SHARE * size
 
 
 def check_markers(robot: Tree, data: Measurements) -> None:

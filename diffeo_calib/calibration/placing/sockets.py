@@ -17,14 +17,12 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, excluded
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_readings,
     check_socket_registration,
     check_sockets,
     warn_of_wrong_sockets,
 )
-from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.identification.identification import Identification, Prior, ReadRows, Rows, described
 from diffeo_calib.calibration.identification.registration import register_sockets, socket_means
 from diffeo_calib.calibration.placing.placement import Elsewhere, Placement, Seen, Settled
@@ -139,12 +137,6 @@ class SocketDevices(ReadingDevices):
             spread = float(away.square().sum(1).mean().sqrt())
             places.append(PlaceErrors(name, len(rows), spread, tuple(distance.error for distance in distances)))
         return tuple(places)
-
-    def warn_of_weakness(self, model: CalibratedKinematics) -> None:
-        """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
-        place, socket = self.sockets.place, self.by_row(len(model.configurations))
-        if model.map.workspace is not None:
-            warn_of_flat_places(model.map, self.positions, socket, place, workspace_deviation(model.map))
 
     @property
     def left_out_spread(self) -> float:
