@@ -58,8 +58,7 @@ from diffeo_calib.sensors.coordinates import marker_tips
 GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
 """Distance, in medians, beyond which the rows that are the farthest off may spoil a registration: it is repeated with
 the share of rows that are closest, at most so often."""
-MOST_COLUMNS = 4
-"""Most columns that are tried in the place of another one: every try is a registration."""
+MOST_COLUMNS = 4  # most that are tried in the place of another one: every try is a registration
 NO_MISTAKE_FOUND = (
     "check the angle unit, the order of the joints, the tip link or DH convention, "
     "and that rows pair joints with their own points"
@@ -251,11 +250,8 @@ def longer_chains(as_read: Reading, data: Measurements) -> Iterator[Reading]:
         added = [name for name in longer.joint_names if name not in robot.joint_names]
         if longer.joint_names[: robot.n] != robot.joint_names or not {joint, *added} <= {*spare}:
             continue
-        values = [
-            _joint_values(columns, spare[name], turns)
-            for name, turns in zip(added, longer.periodic[robot.n :], strict=True)
-        ]
-        more = torch.stack(values, dim=1).to(data.q.device)
+        pairs = zip(added, longer.periodic[robot.n :], strict=True)
+        more = torch.stack([_joint_values(columns, spare[name], turns) for name, turns in pairs], 1).to(data.q.device)
         if bool((more.amax(0) - more.amin(0) > gates.FIXED_RANGE).all()):
             what = f"the table has a column for joint '{joint}', which is below the tip '{robot.tip}'"
             words = f"{what}: choose '{child}' or a link below it as the tip"
@@ -315,15 +311,7 @@ def other_conventions(as_read: Reading, data: Measurements, judge: Judge = regis
         yield as_read._replace(q=data.q @ best.matrix.mT + best.offset, words=_convention_words(fitting, columns))
 
 
-EVERY_GROUP = (
-    other_points,
-    other_rotations,
-    other_units,
-    other_mimics,
-    longer_chains,
-    other_columns,
-    other_conventions,
-)
+EVERY_GROUP = other_points, other_rotations, other_units, other_mimics, longer_chains, other_columns, other_conventions
 
 
 def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = registered) -> list[Convention]:
@@ -378,12 +366,12 @@ class Step(NamedTuple):
     to_the_end: bool
     rows: int
 
-    def sentence(self, before: str = "", after: str = "") -> str:
-        """What is wrong, between some words, and what to do: ``from line 32 on the measured values belong to ...``."""
+    def sentence(self, before: str = "") -> str:
+        """What is wrong, after some words, and what to do: ``from line 32 on the measured values belong to ...``."""
         where = f"from line {self.first} on" if self.to_the_end else f"in lines {self.first} to {self.last}"
         count = f"{abs(self.lag)} line{'s' * (abs(self.lag) > 1)} {'above' if self.lag < 0 else 'below'}"
         return sentence(
-            f"{before}{where} the measured values belong to the joints {count}{after}",
+            f"{before}{where} the measured values belong to the joints {count}",
             got=f"{self.rows} rows that fit there, and not at their own joints",
             fix="pair every configuration with its own measured values: was a line lost or doubled there?",
         )
@@ -404,7 +392,7 @@ def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typic
         rows, others = _paired(lines, number - gates.LARGEST_LAG)
         each[rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
     costs = (distances / (gates.LAG_NEAR * typical)).square().clamp(max=1.0).nan_to_num(1.0)
-    paired, steps = distances[gates.LARGEST_LAG], list[tuple[int, Step]]()
+    paired, steps = distances[gates.LARGEST_LAG], list[Step]()
     least, second = costs.topk(2, dim=0, largest=False).values
     scores = torch.where(costs == least, second, least) - costs - gates.LAG_MISFIT * (costs == 1.0) * ~distances.isnan()
     scores[gates.LARGEST_LAG] = -1.0
@@ -413,13 +401,13 @@ def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typic
         ends = [gates.LAG_CHANGE_COST * ((start > 0) + (end < len(lines))) for _, start, end, _ in runs]
         gain, start, end, number = max((run[0] - end, *run[1:]) for run, end in zip(runs, ends, strict=True))
         if gain <= 0.0:
-            return [step for _, step in sorted(steps)]
+            return sorted(steps)
         there, scores[:, start:end] = distances[number, start:end], -float(len(lines))
         fits = there <= gates.LAG_NEAR * typical
         moved = int((fits & (paired[start:end] > gates.LAG_GROSS * typical)).sum())
         if moved >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * int((~there.isnan()).sum()):
-            last = end == len(lines)
-            steps.append((start, Step(int(lines[start]), int(lines[end - 1]), number - gates.LARGEST_LAG, last, moved)))
+            ends_of_run, lag = (int(lines[start]), int(lines[end - 1])), number - gates.LARGEST_LAG
+            steps.append(Step(*ends_of_run, lag, end == len(lines), moved))
 
 
 def best_run(scores: Tensor) -> tuple[float, int, int]:
@@ -463,8 +451,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
         typical = float(largest_distances(geometry, data)[near].median())
         steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     if steps and not (steps[0].to_the_end and steps[0].first == int(data.line_numbers.min())):
-        more = f" (and {len(steps) - 1} more such blocks)" * (len(steps) > 1)
-        raise MeasurementError(steps[0].sentence("the measurements do not fit this robot: ", more))
+        raise MeasurementError(steps[0].sentence("the measurements do not fit this robot: "))
 
 
 def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, float]]:

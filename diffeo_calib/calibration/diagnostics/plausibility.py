@@ -383,21 +383,21 @@ def check_socket_registration(
         usual = float(distances(*beside).nanmedian())  # fewer positions are fitted nearly exactly
 
     def left(reading: Reading) -> tuple[float, float]:
-        again = register_sockets(around if around is not robot else reading.robot, reading.q, socket)
+        again = register_sockets(around, reading.q, socket)
         return float(again.distances.median()), max(spread(robot.tip_poses(reading.q)[..., :3, 3]), 1e-9)
 
     motion, tried = left(Reading.of(robot, data))[1], [partial(other_units, slides=far)]
     if far and beside is None:
         tried.append(partial(other_conventions, judge=left))
-    what, expected = "these rows do not fit the robot", f"well below the {1e3 * motion:.3g} mm that the tip moves"
+    what = "these rows do not fit the robot" + ": the ball is in no socket" * far
+    expected = f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves"
     if median > max(gates.OTHER_ROBOT_RESIDUALS * usual, gates.OTHER_ROBOT_SHARE * robot.reach):
-        what, far = f"{what} whose positions were measured", True
-        expected = f"below the {1e3 * usual:.3g} mm of these"
-    said = {"what": what + ": the ball is in no socket" * far, "expected": f"a spread within sockets {expected}"}
+        what, far = "the rows in sockets do not fit the robot whose positions were measured", True
+        expected = f"a spread within sockets below the {1e3 * usual:.3g} mm of these"
     fix = "check that all rows are of one robot, the unit and the order of the joints, and that rows carry the names "
     fix += "of their own sockets: of the place and of the socket in it"
-    got = f"a median of {1e3 * median:.3g} mm"
-    check_fit(robot, data, median, {**said, "got": got}, fix * far, groups=tried, judge=left)
+    said = {"what": what, "expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
+    check_fit(robot, data, median, said, fix * far, groups=tried, judge=left)
     most, _, least = fit.tilt.tolist()
     if most < gates.TURNED:
         what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
