@@ -24,7 +24,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics import judged_rows
 from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, block_text, contradicted, excluded, steps_of
 from diffeo_calib.calibration.diagnostics.likely_mistakes import out_of_step
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm

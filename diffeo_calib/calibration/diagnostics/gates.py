@@ -155,12 +155,9 @@ ROUNDING_LEAST, ROUNDING_MOST = 0.5, 1.5
 
 READING_ROWS = 40  # fewer tell too little: a robot of six joints has some thirty geometric errors
 UNSEEN = 0.05  # motion of a reading, relative to that of a coordinate of the ball, that does not show a joint
-# Motion by turns of the tool, per unit of the ball's offset, below which its place is not determined along any
-# direction, or along one.
-TURNED, TILTED = 0.02, 0.05
+TILTED = 0.05  # motion by turns of the tool, per unit of the ball's offset, below which its place is open
 SIZE_SHARE = 0.8  # of the expected error from which the robot's size is warned about
-# Rows of a socket, one says nothing since its place is not known; rows beyond the number of sockets.
-SOCKET_ROWS, SOCKET_SURPLUS = 2, 6
+SOCKET_SURPLUS = 6  # rows in sockets beyond the number of these
 SOCKET_FAR = 0.02  # median distance of the ball from its socket that is doubted, as a part of the robot's reach
 # Relative error of a known distance that is doubted, if it also exceeds so many median distances of the ball from its
 # socket; and its largest relative error in the right unit.
