@@ -183,7 +183,9 @@ def other_points(as_read: Reading, data: Measurements) -> Iterator[Reading]:
     robot, bodies = as_read.robot, data.points.unflatten(1, (data.origins.shape[1], -1))
     for factor, size in _units_of_length():
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
-        yield as_read._replace(points=points, words=f"the positions seem to be {size}: check their unit (`length`)")
+        words = f"the positions seem to be {size}: check their unit (`length`)"
+        words += ", and that of the commanded ones (`joint_length`)" * is_cartesian(robot)
+        yield as_read._replace(points=points, words=words)
     ways = ("late", "after", slice(1, None), slice(-1)), ("early", "before", slice(-1), slice(1, None))
     for late, after, own_rows, others in ways:
         there = as_read._replace(q=data.q[others], points=data.points[own_rows])
