@@ -24,7 +24,6 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     check_readings,
     check_socket_registration,
     registered,
-    warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.identification.identification import (
@@ -309,8 +308,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     registration = registered(robot, table)
     for resting in resting_rows(tables):
         own = register_sockets(registration.geometry, resting.q, resting.device)
-        check_socket_registration(robot, resting, own, registration.geometry)
-        warn_of_other_robot(robot, table, registration, own)
+        check_socket_registration(robot, resting, own, (registration.geometry, table))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     geometry, ball = registration.geometry, None
