@@ -26,7 +26,6 @@ from product_bank import (
     Case,
     calibrated,
     calibrated_poses,
-    simulated,
     sliding_measurements,
     sliding_robot,
     ur10_measurements,
@@ -46,14 +45,6 @@ def arm() -> Case:
 
 
 @pytest.fixture(scope="session")
-def arm_200(arm: Case) -> Case:
-    """The simulated arm, calibrated with 200 poses and the scales of 60."""
-    robot, train, test = simulated(200)
-    given = {"hyperparameters": arm.result.selection.scales}
-    return shared("arm 200", lambda: Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, **given)))
-
-
-@pytest.fixture(scope="session")
 def pair() -> Case:
     """The simulated arm with two markers on its tool, 40 poses."""
     return shared("pair", lambda: calibrated(40, markers=2))
@@ -70,7 +61,7 @@ def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
     robot = sliding_robot()
     train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
-    return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train)))
+    return shared("slider", lambda: Case(robot, train, test, with_usual_scales(robot, train)))
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ WORDS = {
 }
 """Task of the library -> what it does."""
 
-out = Console(width=None if sys.stdout.isatty() else WIDTH)
+out = Console(width=None if sys.stdout and sys.stdout.isatty() else WIDTH)
 err = Console(stderr=True)
 
 
@@ -180,7 +180,9 @@ def end_process(text: str) -> None:
     remove_unfinished()
     with suppress(RuntimeError, OSError):  # the signal may arrive while something else is being printed
         sys.stdout.flush()
-    shown = "\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else ""  # over the progress bar, which hides the cursor
+    shown = (
+        "\r\x1b[2K\x1b[?25h" if sys.stderr and sys.stderr.isatty() else ""
+    )  # over the progress bar, which hides the cursor
     os.write(2, f"{shown}error: {text}.\n".encode())
     os._exit(EXIT_INTERRUPTED)
 

@@ -139,16 +139,3 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     else:
         assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(geometry, arm.test).rms
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
-
-
-@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")
-def test_ctrl_c_ends_the_search_beside_what_may_drift(arm: Case) -> None:
-    tasks, interrupted = list[str](), interrupting("hyper-parameters", 1)
-
-    def progress(name: str, done: int, total: int) -> None:
-        tasks.append(name)
-        interrupted(name, done, total)
-
-    data = arm.train.with_covariates(time=torch.arange(len(arm.train)))
-    assert dc.calibrate(arm.robot, data, progress=progress).interrupted
-    assert tasks.count("hyper-parameters") <= 2, "no second search"

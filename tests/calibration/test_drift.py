@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 from again_bank import true_error
-from command_bank import Command
 from reading_bank import readings, scales
 from table_bank import refused, warned
 from tangent_bank import normal
@@ -22,8 +21,6 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.placing.sessions import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.sensors.known_drift import KnownDrift
 
@@ -149,17 +146,6 @@ def test_beyond_its_rows_a_drift_stays_as_at_the_end(drifted: Any) -> None:
         assert not [line for line in known.in_rows(there) if "outside" in line]
 
 
-def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
-    (q, points), columns = ARM.measure(12, seed=1), {"time": hours(12), "temperature": 20.0 + hours(12)}
-    data: Any = dc.Measurements(q, points, ARM.nominal.joint_names).with_covariates(**columns)
-    both: Any = dc.Observations.joined([data, readings(ARM, "height", 12).with_covariates(**columns)])
-    for rows in (data, both):
-        form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
-        read: Any = read_observations(tmp_path / "t.csv", form)
-        assert read.covariate_names == ("time", "temperature")
-        assert_close(read.rows([3, 1]).covariates, rows.covariates[[3, 1]], rtol=1e-12, atol=0)
-
-
 def test_columns_that_cannot_be() -> None:
     q, points = ARM.measure(12, seed=1)
     table = dc.Measurements(q, points)
@@ -168,28 +154,6 @@ def test_columns_that_cannot_be() -> None:
         ("time", lambda: table.with_covariates(time=[float("nan")] * 12)),
         ("covariate", lambda: dc.Measurements.joined([table, table.with_covariates(time=hours(12))])),
     )
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales", "undrawn")
-def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
-    form = TableFormat("mm", "deg", time="hour")
-    write_measurements(tmp_path / "t.csv", drifting_rows()[:ROWS], form)
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    robot = "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"
-    columns = "--length", "mm", "--angle", "deg", "--position", "x,y,z", "--time", "hour"
-    done = command("fit", tmp_path / "t.csv", *robot, *columns, "-o", tmp_path / "m.safetensors")
-    assert done.code == 0
-    assert "drift with time" in done.out
-    for name, *more in (
-        ("evaluate", tmp_path / "t.csv", "-o", tmp_path / "r.csv"),
-        ("evaluate", tmp_path / "t.csv", "--report", tmp_path / "r.html"),
-        ("export", "--c", tmp_path / "m.c"),
-        ("recalibrate", tmp_path / "t.csv"),
-    ):
-        said = command(name, tmp_path / "m.safetensors", *more)
-        assert "another set-up" not in said.err
-        assert re.search(r"drift with time from 3\S* to [67]\S* .* holds for [45]\.", said.out.replace("\n", " ")), said
 
 
 @pytest.mark.parametrize(("left", "better"), [([0.9] * 100, True), ([1.0] * 99 + [0.0], False), ([0.99] * 100, False)])

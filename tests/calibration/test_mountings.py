@@ -9,12 +9,9 @@ import pytest
 import torch
 from product_bank import usual_scales
 from source_bank import remounted
-from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -113,17 +110,3 @@ def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None
     with pytest.warns(DiffeoCalibWarning) as caught:
         calibrated(data.with_sessions(names, remounted=said))
     assert sum("--remounted" in str(one.message) for one in caught) == 1
-
-
-def test_set_ups_are_named(tmp_path: Path) -> None:
-    path, columns = tmp_path / "t.csv", ["x", "y", "z"]
-    write_measurements(path, remounted(ARM, table(10, 1)), TableFormat("m", "rad"))
-    known: dict[str, Any] = {"length": "m", "angle": "rad", "remounted": True}
-    same = dc.read_measurements(path, ARM.nominal, columns, session="session", **known)
-    assert (same.remounted, same.session_names) == (True, ("a", "b", "c"))
-    q, poses = ARM.sample(6, seed=1), torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
-    posed = dc.Measurements.from_poses(q, poses, ARM.nominal.joint_names, doubt=False)
-    refused(
-        ("`remounted` without `session`", lambda: dc.read_measurements(path, ARM.nominal, columns, **known)),
-        ("expected positions, got poses", lambda: posed.with_sessions(list("aabbcc"), remounted=True)),
-    )

@@ -23,7 +23,6 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.noise_model import differing_factor
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -101,15 +100,6 @@ def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
     found = log_posterior(scales.logarithms(), setting.scales, data)
     assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)
     assert found.prior == pytest.approx(log_prior(scales, setting.scales), rel=1e-9)
-
-
-def test_three_slides_whose_scales_change_together_count_once() -> None:
-    centre, data = of_places()
-    first = 2 * data.x.shape[1]  # of the coupled length scales
-    for count, expected in ((3, -0.5), (1, -0.5 * (1 / 9 + 6 / 9 / selection.AXES**2))):  # one alone hardly may
-        point = centre.logarithms()
-        point[first : first + count] += 0.2
-        assert log_posterior(point, centre, data).prior == pytest.approx(0.2**2 * expected)
 
 
 def of_places() -> tuple[dc.Hyperparameters, TangentData]:
@@ -193,20 +183,6 @@ def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     seen = noise_blocks(scales, nominal, test.q).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
     assert float(seen) > 0.5 * float((test.points - arm.true_points(test.q)).norm(dim=-1).square().mean().sqrt())
     assert float(scales.joint_noise.max()) > 3e-5
-
-
-# --- rows around a geometric calibration ------------------------------------------------------------------------------
-
-
-def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
-    """Whatever was asked for before: other scales, other weights, other measurements, fewer rows."""
-    first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
-    kept, other = setting.tangent_data.with_tails(setting.tangent_data.tails), weighted(setting, 3)
-    kept.process(first)
-    some = kept.rows(torch.arange(3))
-    orders = [(kept.with_tails(other.tails), first), (kept, second), (kept, first), (some, first)]
-    for data, scales in [*orders, (replace(kept, y=kept.y + 1e-3), first)]:
-        assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
 
 
 # --- six numbers of a pose in place of nine coordinates ---------------------------------------------------------------

@@ -167,16 +167,6 @@ def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
     assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
 
 
-def test_a_path(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
-    output = program.with_name("c")
-    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
-    assert done.code == 0
-    names = list(model.robot.joint_names)
-    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
-    assert np.abs(change).max() <= 0.01 + 1e-9
-    assert any("the corrections of the path jump" in line for line in done.warnings)
-
-
 def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -> None:
     model, output = posed.model, program.with_name("corrected.csv")
     dc.save(model, program.with_name("posed"))

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import importlib
 import re
-import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from command_bank import Command, Site, edited, environment, run_process, set_cell
+from command_bank import Command, Site, edited, run_process, set_cell
 
 import diffeo_calib as dc
 from diffeo_calib.cli import console
@@ -120,19 +118,6 @@ def test_completion_loads_nothing_slow(words: str, expected: list[str]) -> None:
     assert done.out.split() == expected
 
 
-def test_the_script_of_the_completion_asks_the_program(tmp_path: Path) -> None:
-    variables = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = run_process("--show-completion", "bash", variables=variables)
-    assert done.code == 0
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in done.out
-    assert re.search(r"^complete .*-F \w+ diffeo-calib$", done.out, re.MULTILINE)
-    done = run_process("--install-completion", "bash", variables={**variables, "HOME": str(tmp_path)})
-    assert done.code == 0
-    (script,) = (tmp_path / ".bash_completions").iterdir()
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in script.read_text()
-    assert str(script) in (tmp_path / ".bashrc").read_text()
-
-
 def test_the_module_is_the_program() -> None:
     done = run_process("-h", program=("-m", "diffeo_calib"))
     assert done.code == 0
@@ -147,24 +132,6 @@ def test_the_console_script_points_into_the_package() -> None:
     assert found is not None
     assert callable(getattr(importlib.import_module(found[1]), found[2]))
     assert version("diffeo_calib") == dc.__version__
-
-
-@pytest.mark.parametrize(
-    ("output", "message"), [("none/model", "make its folder first"), ("model", "no file t.csv; check")]
-)
-def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_path: Path) -> None:
-    fit = ["fit", "t.csv", "--robot", "r.urdf", "--base", "a", "--tip", "b", "--position", "x,y,z"]
-    units = ["--length", "m", "--angle", "rad", "-o", str(tmp_path / output)]
-    command = [sys.executable, "-c", LIGHT, *fit, *units]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=60, check=False, encoding="utf-8")
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert "torch" not in done.stderr.splitlines()[-1]
-
-
-def test_evaluate_loads_nothing_that_draws() -> None:
-    program = "import sys, diffeo_calib.cli.commands.evaluate; print('matplotlib' in sys.modules)"
-    assert run_process(program=("-c", program)).out == "False\n"
 
 
 ESCAPE = "\x1b[31mred\x07"

@@ -91,16 +91,6 @@ def test_init_joins_by_columns_that_name_the_same_rows(joints: str, places: str,
     assert [own[0] for _, own in read_cells(path, ",")[1]] == (["1.5", "0.5"] if by == "pose" else ["P3", "P1", "P2"])
 
 
-def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.joints, files.urdf, "-o", tmp_path / "c.toml")
-    assert "if they are in another file: --places FILE --by name;" in done.error
-    done = command("init", files.joints, files.urdf, "--places", files.whole, "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have" not in done.error
-    (tmp_path / "p.csv").write_text("x,y,z\n1,2,3\n")
-    done = command("init", files.joints, files.urdf, "--places", tmp_path / "p.csv", "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have, got name, " in done.error
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

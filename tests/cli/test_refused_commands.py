@@ -149,20 +149,3 @@ def test_outputs_are_checked_before_the_fit(small_site: Site, command: Command, 
             done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
             assert done.code == 1
             assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
-
-
-def test_files_that_are_none(small_site: Site, command: Command, tmp_path: Path) -> None:
-    for csv, message in ((tmp_path / "nowhere.csv", "there is no file"), (tmp_path, "is a folder: expected a table")):
-        assert message in command(*small_site.fit(csv, tmp_path / "model")).error
-    joints = ",".join(f"q{number}" for number in range(6))
-    (tmp_path / "joints.csv").write_text(f"{joints},image\n0,0,0,0,0,0,{'x' * 5000}\n", encoding="utf-8")
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "a.png").write_bytes(b"")
-    words = tmp_path / "images", tmp_path / "joints.csv", "--board", "chessboard:7x5:0.03", "--length", "mm"
-    done = command("images", *words, "-o", tmp_path / "corners.csv")
-    assert done.code == 1
-    assert "File name too long; check the path" in done.error
-    if (zero := Path("/dev/zero")).exists():  # a device without an end
-        assert "no text but binary" in command(*small_site.fit(zero, tmp_path / "model")).error
-        assert "is no file" in command(*small_site.fit(small_site.csv, tmp_path / "model", "--robot", zero)).error
-        assert "there is no model file /dev/zero" in command("evaluate", zero, small_site.csv, *TABLE).error

@@ -188,25 +188,6 @@ def test_joints_stop_at_their_limits(arm: CModel) -> None:
 
 
 @needs_compiler
-def test_joints_beyond_their_limits_come_back_and_the_rest_makes_up_for_them(arm: CModel) -> None:
-    q = HOME.copy()
-    q[0], q[4] = LIMIT + 0.3, -LIMIT - 0.05
-    target = pose_at(arm, q)
-    for _ in range(8):
-        before, (q, _) = q, arm.newton_step(q, target)
-        assert np.linalg.norm(q - before) <= 0.1 * (1 + 1e-12)
-    assert (np.abs(q) <= LIMIT).all()
-    q = HOME.copy()
-    q[0] = LIMIT + 0.01
-    target = pose_at(arm, q + 0.001)
-    e, J = linearised(arm, q, target, 0.1)
-    expected = np.linalg.lstsq(J[:, 1:], e + 0.01 * J[:, 0], rcond=None)[0]
-    after, _ = arm.newton_step(q, target, bound=10.0)
-    assert after[0] == LIMIT
-    np.testing.assert_allclose(after[1:] - q[1:], expected, rtol=0, atol=1e-5)
-
-
-@needs_compiler
 @pytest.mark.parametrize("name", ["one joint", pytest.param("gantry", marks=pytest.mark.slow)])
 def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
     """They reach the poses that they can reach; another frame and prefix."""

@@ -144,21 +144,6 @@ def test_exported_and_read_by_another_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_compiled_without_graph_breaks() -> None:
-    torch.compiler.reset()
-    for name, output in (("slides", "points"), ("one joint", "tool_poses")):
-        model = made(name, markers=3)
-        program = TorchProgram(model, output)
-        same(torch.compile(program, fullgraph=True, backend="eager")(queries(model)), program(queries(model)))
-    model = made("one joint", markers=3)
-    live = queries(model).requires_grad_()
-    compiled = torch.compile(TorchProgram(model), fullgraph=True, backend="aot_eager")
-    (slope,) = torch.autograd.grad(compiled(live).sum(), live)
-    same(slope, model.jacobian(live.detach()).sum((1, 2)), 1e-10)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_onnx_runs_to_rounding(tmp_path: Path, dtype: torch.dtype) -> None:
     runtime = pytest.importorskip("onnxruntime")

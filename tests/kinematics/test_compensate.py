@@ -170,24 +170,6 @@ def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
     assert dc.compensate(arm.model, aside, regular, tool=tool_frame()).counts.get("singular", 0) == 0
 
 
-def test_a_stretched_arm_ends_where_the_workspace_does(arm: Case) -> None:
-    """Targets beside a stretched elbow, by what searches without a bound find from both sides."""
-    straight = torch.zeros(6201, 6, dtype=torch.float64)
-    straight[:, 2] = torch.linspace(-3.1, 3.1, 6201, dtype=torch.float64)
-    frames, q = arm.robot.joint_frames(straight)[..., :3, 3], commands(arm, 60, seed=7)
-    q[:, 2] = straight[(frames[:, 4] - frames[:, 1]).norm(dim=1).argmax(), 2]
-    targets, possible = intended(arm, q), torch.zeros(60, dtype=torch.bool)
-    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    for side in (-0.3, -0.1, 0.1, 0.3):
-        bent = q + torch.tensor([0.0, -side / 2, side, -side / 2, 0.0, 0.0])
-        wide = dc.compensate(arm.model, targets, bent, tool=tool_frame(), bound=0.8, limits=[[-20.0, 20.0]] * 6)
-        possible |= wide.reached
-    judged = torch.tensor([s in ("singular", "unreachable") for s in found.status])
-    singular = torch.tensor([s == "singular" for s in found.status])
-    assert int(judged.sum()) > 30
-    assert float((possible == singular)[judged].double().mean()) > 0.95
-
-
 # --- limits ---------------------------------------------------------------------------------------------------------
 
 
@@ -319,14 +301,3 @@ def test_the_slowest_change_of_a_jump() -> None:
     kept = pace.limited(spike, firm)[:, 0]
     assert np.isnan(kept[4])
     assert not np.delete(kept, 4).any()
-
-
-def test_one_start_for_a_whole_path(arm: Case) -> None:
-    q = line(arm, 12)
-    targets = intended(arm, q)
-    found = dc.compensate(arm.model, targets, q[0], tool=tool_frame())
-    assert bool(found.reached.all())
-    torch.testing.assert_close(found.start[1:], found.q[:-1], rtol=0, atol=0)
-    torch.testing.assert_close(found.start[0], q[0], rtol=0, atol=0)
-    every = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    torch.testing.assert_close(found.q, every.q, rtol=0, atol=1e-7)

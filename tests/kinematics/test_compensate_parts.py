@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-
 import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
-from product_bank import Case
 from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
@@ -108,13 +104,6 @@ def test_the_nearest_command_weighs_both_hands(model: dc.CalibratedKinematics, q
     assert float((slope * inside).norm(dim=1).max()) < 1e-4 * float(before.norm(dim=1).max())
 
 
-def test_the_tool_of_the_model_is_that_of_its_tip(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
-    wanted = torch.stack([model.tool_poses(q, TOOLS[0], tip="left"), model.tool_poses(q, None, tip="right")], dim=1)
-    found = dc.compensate(model.with_tool(TOOLS[0], "left"), wanted, start)
-    assert bool(found.reached.all())
-    assert_close(model.tool_poses(found.q, TOOLS[0], tip="left"), wanted[:, 0], rtol=0, atol=2e-9)
-
-
 def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     targets, start = torch.zeros(2, 2, 3, dtype=torch.float64), torch.zeros(2, 5)
     missing = targets.clone()
@@ -130,15 +119,6 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     for change, message in wrong:
         with pytest.raises(InputError, match=message):
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
-
-
-def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
-    model = arm.model.with_tool([0.0, 0.0, 0.1])
-    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
-    seen = weakref.ref(model)
-    del model
-    gc.collect()
-    assert seen() is None
 
 
 @pytest.mark.parametrize("axes", [3, 1, 0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import implausible, judge
+from diffeo_calib.calibration.diagnostics.judged_rows import judge
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import place, residuals, rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
@@ -126,26 +125,6 @@ def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
         warn_outside_range(arm.model, q)
     assert record[0].filename == __file__
-
-
-def test_implausible_errors_have_a_sentence(arm: Case, posed: Case) -> None:
-    assert implausible(arm.model, arm.test, dc.evaluate(arm.model, arm.test)) is None
-    shifted = dc.Measurements(arm.test.q, arm.test.points + 0.05)
-    errors = dc.evaluate(arm.model, shifted)
-    text = implausible(arm.model, shifted, errors) or ""
-    assert text.startswith("these errors are not those of a calibrated robot: expected a median of about ")
-    assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
-    unsure = arm.model.changed(map=arm.model.map.inflated(1e5))
-    for shift, told in ((0.05, False), (0.15, True)):  # a tenth of the reach is too much whatever a model expects
-        shifted = dc.Measurements(arm.test.q, arm.test.points + shift)
-        assert (implausible(unsure, shifted, dc.evaluate(arm.model.__call__, shifted)) is not None) == told
-    zero = np.zeros((len(posed.test), 3))
-    turned = dc.Measurements.from_poses(posed.test.q, moved(posed.test.poses, zero, zero + 0.03))
-    text = implausible(posed.model, turned, dc.evaluate(posed.model, turned)) or ""
-    assert re.search(r"about 0\.0\d+ degrees by the model's .* got 2\.98 degrees; check .*`convention`", text)
-    far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
-    with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--free both"):
-        dc.evaluate(arm.model, far)
 
 
 # --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------

@@ -117,12 +117,6 @@ def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
         assert [line for line, _ in rows] == list(range(4, 11))
 
 
-def test_a_text_may_begin_with_the_name_of_a_program(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("MATLAB export of Monday\nq1,q2\n1.5,2.5\n", encoding="utf-8")
-    file = CsvLines(tmp_path / "t.csv", ",")
-    assert (file.header, file.rows()) == (["q1", "q2"], [(3, ["1.5", "2.5"])])
-
-
 def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
