@@ -4,8 +4,6 @@ Waiting for a second thread costs more than it brings on a busy machine; it is s
 and for the processes that tests start. Calibrations cost seconds, so files share them.
 """
 
-from __future__ import annotations
-
 import os
 import re
 

@@ -1,7 +1,5 @@
 """Laws that errors of every kind of measurement obey, and crossings of kinds that are refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

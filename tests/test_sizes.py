@@ -3,8 +3,6 @@
 And a package that only shrinks: its lines and those of each of its folders are held at the numbers of sizes.json.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import json

@@ -1,7 +1,5 @@
 """Tables of a simulated arm for `init`; measured with a tracker, in sockets, and by a wire from two anchors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

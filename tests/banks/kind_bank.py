@@ -3,8 +3,6 @@
 A part of the rows is kept for the verbs that judge. The models' numbers are held by tests/golden.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 import tempfile

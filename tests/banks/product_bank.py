@@ -4,8 +4,6 @@ The covariance formulas are those of DESIGN sections 5 and 6, with explicit loop
 nothing is shared with the package but the data types and the geometry's derivatives.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path

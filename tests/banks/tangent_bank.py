@@ -3,8 +3,6 @@
 Nothing is shared with the package but data types, the nominal map and its derivatives by joints and error twists.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from math import pi

@@ -1,7 +1,5 @@
 """`calibrate` on robots whose errors are known: gains of every stage, its arguments, and how it ends early."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Drift with a column of times or temperatures: found where it is, left out where it is not, undone in other rows."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

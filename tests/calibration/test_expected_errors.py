@@ -1,7 +1,5 @@
 """What a model expects of itself, and what its parts explain, against the truth of a simulated arm."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest

@@ -1,7 +1,5 @@
 """Errors by the position of a joint: gear lines and axes, found by evidence; scales of other robots of its type."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace

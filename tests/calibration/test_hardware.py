@@ -3,8 +3,6 @@
 Needs DIFFEO_CALIB_DATA. The bounds are slightly above what this version reaches.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Geometric identification: parameters, noise, tails and prior, on simulated truth and on hardware."""
 
-from __future__ import annotations
-
 from math import inf
 
 import pytest

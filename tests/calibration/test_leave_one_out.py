@@ -1,7 +1,5 @@
 """Rows and folds that are left out: weights, errors and deviations outside of the fit, by closed forms and refits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 from math import inf

@@ -1,7 +1,5 @@
 """Markers that are mounted anew between sessions of one measuring frame: found, fitted, judged, predicted, saved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

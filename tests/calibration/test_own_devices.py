@@ -1,7 +1,5 @@
 """Kinds of devices from outside the package, those of scripts/examples, and a rigid tool held by two hands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Planned poses: the greedy choice against brute force, what is known before it, and whether expectations come true."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any

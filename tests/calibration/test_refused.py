@@ -1,7 +1,5 @@
 """Rows that cannot belong to the robot: refused if a mistake explains them, else calibrated with a warning."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Scales: defaults, the log posterior against scipy and formulas, the search; the rows that they are chosen for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

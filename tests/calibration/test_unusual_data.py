@@ -1,7 +1,5 @@
 """Unusual data: other numbers of joints, repeats, known deviations, and markers that some rows hide."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from math import nan

@@ -1,7 +1,5 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import io

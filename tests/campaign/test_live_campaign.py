@@ -1,7 +1,5 @@
 """A campaign judges rows as they come: algebra against a fresh factorisation, named mistakes, the result."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

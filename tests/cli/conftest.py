@@ -1,7 +1,5 @@
 """The command line in this process, and one robot with its table and its fitted model for all files."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path

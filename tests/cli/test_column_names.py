@@ -1,7 +1,5 @@
 """What `init` reads in the names of columns, as devices and programs write them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

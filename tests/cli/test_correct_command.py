@@ -1,7 +1,5 @@
 """`diffeo-calib correct`: programs of commands and of targets, read back and checked against the model."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

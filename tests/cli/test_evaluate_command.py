@@ -1,7 +1,5 @@
 """`diffeo-calib evaluate`, with --free too, and `predict`; what they say about a model's origin."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -3,8 +3,6 @@
 What a terminal shows of names and cells, short and without control characters; the progress line.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from importlib.metadata import version

@@ -1,7 +1,5 @@
 """`init`: which robot, link, columns, units and conventions it proposes, and what `fit` says of the same."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """`init`: sockets, rotations, deviations, wires, payloads and cameras of a table."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """--json: the results of every command for programs, as the schema describes them."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables whose lines name their marker, and measured places in a file of their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple

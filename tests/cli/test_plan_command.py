@@ -1,7 +1,5 @@
 """`diffeo-calib plan`: first poses, next poses and poses to measure again, as tables that `fit` reads."""
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Wrong usage, options and tables with mistakes, broken files: an exit code and one sentence that says what to do."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Balls in sockets, readings, payloads, and rows of several kinds on the command line, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Ctrl-C at any moment: one sentence, and the best model so far if there is one.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -67,7 +65,7 @@ def written(folder: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "where"), [("predict", "cut pipes"), ("register", "a full disk"), ("c", "nothing")])
 def test_work_is_done_whatever_happens_to_the_output(
-    name: str, where: str, small_site: Site, sound_path: Path, tmp_path: Path, command: Command
+    name: str, where: str, small_site: Site, sound_path: Path, tmp_path: Path, *, command: Command
 ) -> None:
     for folder, streams in ((tmp_path / "usual", None), (tmp_path / "nowhere", NOWHERE[where])):
         folder.mkdir()

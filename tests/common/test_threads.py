@@ -1,7 +1,5 @@
 """Small work runs on one thread, large work on those that the user allows, and every setting is restored afterwards."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 from concurrent.futures import ThreadPoolExecutor

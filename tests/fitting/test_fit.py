@@ -1,7 +1,5 @@
 """The arguments of `fit`: solvers, integrators, backends, fewer control points, and what it refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from math import nan

@@ -1,7 +1,5 @@
 """Time stepping, ours and torchdiffeq's: orders of convergence, tolerances, quadrature, gradients, mistakes."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -9,8 +9,6 @@ their last digit, and at least 1e-9.
     python tests/golden/write.py --keep           new numbers of this machine; tolerances as in the file
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """The generated files as C: results, the Newton step, names, memory, warnings, C++, and refusals."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

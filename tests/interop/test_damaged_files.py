@@ -1,7 +1,5 @@
 """Damaged and edited model files, files of other kinds, failing saves: each is refused with one clear sentence."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -3,8 +3,6 @@
 The kinematics file of Universal Robots' packages: by their formula it gives the poses of the geometry.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -1,7 +1,5 @@
 """Models evaluated by NumPy, by torch's programs and by generated C: points, slopes and poses of the torch model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -6,8 +6,6 @@ were written at commit 29d55d1, before the package had its present folders and n
 Where a model comes from, and its summary: kept by every copy, saved and loaded, from files of every age.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

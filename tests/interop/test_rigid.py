@@ -3,8 +3,6 @@
 Correction tables and joint offsets: the joint comes to where it should, signs and ranges included.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Torch programs of models: the same numbers as the model, by plain calls, traced, exported and as ONNX."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Corrected URDF files: the poses of the geometry in two readers, and every other byte as it was."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Compiled sums are executed: they are kept where nobody but the user can write, or for this process only."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Sums in several processes: the same numbers as in one, in every rank; a lost rank is an error in all others."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket

@@ -1,7 +1,5 @@
 """Fused sums: they equal sums over one matrix, whatever the threads, the processor's vectors, and what is installed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -4,8 +4,6 @@ Every formula is compiled with one profile, the other operations of profiles wit
 7 s where KeOps' cache folder is empty.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A user's kernel that defines only its matrix, and a user's radial profile: every method, fits, files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Kernel sums of every backend: those of one matrix, on unusual input, differentiable; which backend is chosen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product

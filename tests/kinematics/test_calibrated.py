@@ -1,7 +1,5 @@
 """Calibrated kinematics: call, Jacobian, prediction, inverse, and input in all forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands that bring a calibrated tool to its targets: round trips, optimality in the box, statuses."""
 
-from __future__ import annotations
-
 from math import radians
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands for both hands of a small robot: against the model itself and one hand at a time; mimic joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Data frames of pandas and polars wherever joints are passed: columns by name, in any order, among others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

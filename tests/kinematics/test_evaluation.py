@@ -1,7 +1,5 @@
 """Errors of kinematics against NumPy, in position and orientation, and warnings about calibrated models."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

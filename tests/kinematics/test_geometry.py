@@ -1,7 +1,5 @@
 """Geometric errors, gravity sag, gears and axes: points, what absorbing errors means, names."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from math import pi

@@ -3,8 +3,6 @@
 What is known of a camera and its board is what small changes of the fit's parameters do to their poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

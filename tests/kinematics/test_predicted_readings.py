@@ -1,7 +1,5 @@
 """What devices will read: means as their readings, regions that hold new ones, units, and the command's columns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

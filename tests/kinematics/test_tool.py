@@ -3,8 +3,6 @@
 torch.func and torch.compile pass through models: they give what the model's own Jacobian gives.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

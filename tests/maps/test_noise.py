@@ -1,7 +1,5 @@
 """Noise with shifts that rows share, against the explicit matrix; and the measurements that a fitted map implies."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from fit_bank import shared_noise

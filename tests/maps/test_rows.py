@@ -1,7 +1,5 @@
 """A deformation at its own controls, and rows of several kinds as one observation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Rotations against SciPy and against written-out formulas, and poses as three points: there, back, and derivatives."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

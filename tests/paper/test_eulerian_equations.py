@@ -1,7 +1,5 @@
 """The paper's formulation at fixed points: equations (16)-(21) one by one, and the exact model for comparison."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

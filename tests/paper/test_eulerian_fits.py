@@ -1,7 +1,5 @@
 """Fits in the paper's formulation: its algorithms, gradient descent, and what it does not support."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

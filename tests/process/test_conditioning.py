@@ -1,7 +1,5 @@
 """The process conditioned on rows: against formulas with the whole covariance, in any order, with priors of a metre."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

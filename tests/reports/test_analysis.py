@@ -1,7 +1,5 @@
 """Numbers of reports, against brute force and against the truth of the simulated arm."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The HTML report: complete, self-contained, small, and true to the numbers it was made from."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Laws of every robot: poses of pinocchio, exact derivatives, descriptions that come back, the view from its tip."""
 
-from __future__ import annotations
-
 import json
 from math import pi
 from pathlib import Path
