@@ -27,6 +27,7 @@ from product_bank import (
     sliding_measurements,
     sliding_robot,
     ur10_measurements,
+    usual_scales,
     with_usual_scales,
 )
 from shared_bank import begin, shared
@@ -59,7 +60,8 @@ def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
     robot = sliding_robot()
     train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
-    return shared("slider", lambda: Case(robot, train, test, with_usual_scales(robot, train)))
+    scales = usual_scales(robot).inflated(2.0)
+    return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
 
 
 @pytest.fixture

@@ -104,9 +104,6 @@ def test_names_say_what_they_hold() -> None:
     assert {word: uses[word] for word in VAGUE if uses[word] > MOST_USES} == {}
 
 
-# --- lines only fall ----------------------------------------------------------------------------------------------
-
-
 def lines_of_package() -> dict[str, int]:
     """Name of each folder of the package, "root" and "total" -> its lines."""
     found: Counter[str] = Counter()

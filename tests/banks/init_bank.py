@@ -32,8 +32,6 @@ def reasons(text: str) -> dict[str, str]:
     return {line.partition(" = ")[0]: why for line, _, why in lines}
 
 
-# --- without a tracker ------------------------------------------------------------------------------------------------
-
 ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
 """(2, 3) Fixed points of the wire in the robot's base frame, m."""
 

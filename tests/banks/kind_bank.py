@@ -260,8 +260,6 @@ def of_payload(kind: Kind) -> dc.CalibratedKinematics:
     return kind.model.with_payload(4.0) if kind.name == "payloads" else kind.model
 
 
-# --- checks -----------------------------------------------------------------------------------------------------------
-
 NUMBERED = ("line_numbers", "device", "session", "socket")
 FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")
 """Columns that follow from the corners of all images of a table."""

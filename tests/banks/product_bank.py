@@ -178,9 +178,6 @@ def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measur
     return dc.Measurements(q, points + torch.from_numpy(noise), robot.joint_names)
 
 
-# --- the tangent model, written a second time ---------------------------------------------------------------------
-
-
 def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:
     """K_V = diag_l(a_l^2 k_l + c_l^2 k_all), Matern 5/2 and Gaussian: (M, n), (N, n) -> (M, N, n)."""
     d = x[:, None] - other[None]

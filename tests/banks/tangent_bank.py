@@ -122,9 +122,6 @@ def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
     return prior_covariance(data, scales) + torch.block_diag(*data.noise_of_numbers(scales))
 
 
-# --- formulas -----------------------------------------------------------------------------------------------------
-
-
 def places(chain: Tree) -> list[int]:
     """Frames (the tip's last) that are not always in the point where the frame before is."""
     q = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (9, chain.n)))

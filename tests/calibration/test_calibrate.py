@@ -107,9 +107,6 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
 
 
-# --- calibrations that end early --------------------------------------------------------------------------------------
-
-
 def interrupting(task: str, at: int):
     """A progress callback that behaves as if Ctrl-C came at this place, once."""
     state = {"done": False}

@@ -112,9 +112,6 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
     assert inflation(70.0, 60) == inflation(70.0), "repeats add nothing"
 
 
-# --- folds ------------------------------------------------------------------------------------------------------------
-
-
 def test_rows_along_motions_and_repeats_belong_together() -> None:
     """In one motion, and in one fold."""
     rng = np.random.default_rng(0)

@@ -78,22 +78,6 @@ def test_the_marker_of_each_session_is_predicted(result: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_marker_that_a_session_hides() -> None:
-    """It is where it was, and nothing is predicted of it there."""
-    arm = SimulatedArm(seed=1, markers=2)
-    rows = remounted(arm, dc.Measurements(*arm.measure(90, seed=1), arm.nominal.joint_names), SHIFTS)
-    points, names = rows.points.clone(), rows.device_names
-    points[[name == "c" for name in names], 1] = torch.nan
-    data = dc.Measurements(rows.q, points, arm.nominal.joint_names).with_sessions(names, remounted=True)
-    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal))
-    assert [text.partition(" away")[0].count("not seen") for text in found.placement.sentences()] == [0, 1]
-    (b, c) = found.model.predict_readings(rows.q[:3])
-    assert bool(b.mean.isfinite().all())
-    assert c.mean.isnan().view(3, 2, 3).any(2).any(0).tolist() == [False, True]
-    assert dc.evaluate(found.model, data).rms < 1e-4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("said", [False, True])
 def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None:
     """Frames are taken for markers, and markers for frames."""

@@ -69,8 +69,6 @@ def test_kinds_are_registered_once() -> None:
     assert KINDS["height"] is not other
 
 
-# --- a tool held by two hands, beside measured poses of both ----------------------------------------------------------
-
 AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
 ORIGINS = ("0 {side} 0.3", "0 0 0.2", "0 0 0.35", "0.3 0 0", "0.1 0 0", "0.1 0 0")
 NEWTON_STEPS = 12

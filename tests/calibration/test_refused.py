@@ -26,9 +26,6 @@ ARM, ROWS, _ = simulated(30)
 ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
 
 
-# --- refused ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("q", "points", "words"),
     [
@@ -71,9 +68,6 @@ def test_rows_that_cannot_be_those_of_the_robot_are_refused() -> None:
         (r"at least 3 poses, got .*measure more poses", calibrated(Q[:2], POINTS[:2])),
         (r"same configuration|does not move", calibrated(Q[:1].repeat(30, 1), POINTS[:1] + 1e-5 * normal(30, 1, 3))),
     )
-
-
-# --- doubtful rows ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:rail. never moved")

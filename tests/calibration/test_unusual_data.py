@@ -124,9 +124,6 @@ def test_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert float((squares < 7.8147).double().mean()) > 0.9
 
 
-# --- hidden markers ---------------------------------------------------------------------------------------------------
-
-
 def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
     one = case("hidden markers")
     problem = robot_problem(one.data, one.scales)

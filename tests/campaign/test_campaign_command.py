@@ -1,6 +1,5 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
-import errno
 import http.client
 import io
 import json
@@ -111,23 +110,6 @@ def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
             Journal(path)
 
 
-def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "run.csv"
-    table = GrowingTable(path)
-    table.append(*table.written({"a": 1}))
-
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(InputError, match="No space left on device"):
-            table.append(*table.written({"a": 2}))
-    assert path.read_text() == "a\n1\n"
-    table.append(*table.written({"a": 3}))
-    assert table.new_lines() == [b"1\n", b"3\n"]
-
-
 def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     table, seen = GrowingTable(path), list[bytes]()
@@ -210,40 +192,6 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
         file.write(lines[21])
     assert command(*accepted, "--tolerance", "50mm").code == 0
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
-
-
-def test_rows_that_are_there_before_are_judged_as_with_once(
-    tmp_path: Path, lines: list[str], command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also without a row that comes later; a line that cannot be read is named by its place in the table.
-
-    No line can be read where a column is missing: the campaign ends, and the journal says nothing.
-    """
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
-    wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
-    (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--position", "x,y,w")
-    assert done.code == 1
-    assert "run.csv', header: no column ['w']" in done.error
-    assert (tmp_path / "run.csv.journal").read_bytes() == b""
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--length", "m")
-    assert any(f"file '{tmp_path / 'run.csv'}': " in text for text in done.warnings)  # 1000 m
-    (tmp_path / "run.csv.journal").unlink()
-    accepted = []
-    goal = '"error_limit_mm": null, "more_rows": '
-    for how, known in (  # the last one answers in JSON
-        (["--once"], "mm expected"),
-        (["--stdin", "--tolerance", "1um"], goal),
-        (["--stdin"], '"expected_error_mm": 0.'),
-    ):
-        done = command("campaign", tmp_path / "campaign.toml", *how, "--accepted", tmp_path / "accepted.csv")
-        assert done.code == (4 if known == goal else 0)
-        for words in ("row 15 looks wrong", known, "run.csv', line 17"):
-            assert words in done.out
-        assert (goal in done.out) == (known == goal)
-        accepted.append((tmp_path / "accepted.csv").read_text())
-        (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1] == accepted[2] == "".join([*lines[:14], lines[14]])
 
 
 @pytest.mark.slow
@@ -398,20 +346,6 @@ def test_pages_of_nothing_and_of_a_row(tmp_path: Path, run: Callable[..., tuple[
     assert len(clicked) == 3
     assert "header" in unreadable["error"]
     assert (taken["line"], rejected["accepted_rows"], len(repeated["next"])) == (2, 0, 1)
-
-
-def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
-    """A program that counts anew loses no row in silence, also after the campaign was started again."""
-    first = [row(0), row(1), row(2, id="two"), row(1), row(1, id="1"), row(2, id="two")]
-    other = [row(3, id=1), row(3, id="1"), row(3, id="two"), row(3, id=None), row(3, id="")]
-    for again in (0, 1):
-        done, answers = run([*first, *other])
-        assert done.code == 0
-        answers = answers[again:-1]
-        assert [one.get("line") for one in answers] == [2, 3, 4, 3, 3, 4, *5 * [None]]
-        assert all("whose values are others" in one["error"] for one in answers[6:9])
-        assert all("leave it out" in one["error"] for one in answers[9:])
-    assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
 
 
 def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:

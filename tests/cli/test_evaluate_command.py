@@ -42,9 +42,6 @@ def numbers_in(path: Path) -> tuple[list[str], np.ndarray]:
     return header.split(";"), np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
 
 
-# --- errors ---
-
-
 def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command) -> None:
     done = command("evaluate", path, site.csv, *TABLE)
     assert (done.code, done.err.strip()) == (0, "")
@@ -100,9 +97,6 @@ def test_wrong_rows_are_named(site: Site, path: Path, command: Command, tmp_path
     assert "moving the measuring device by 200 mm" in warning
 
 
-# --- predictions ---
-
-
 def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     """In blocks of seven rows."""
     command.monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", 7)
@@ -151,9 +145,6 @@ def test_predicted_poses_are_measurements_of_other_commands(
     np.testing.assert_allclose(values[:, 6:9], 1e3 * poses[:, :3, 3].numpy(), rtol=0, atol=1e-9)
     np.testing.assert_allclose(values[:, 9:12], 1e3 * std[:, :3], rtol=1e-6)
     np.testing.assert_allclose(values[:, -3:], std[:, 3:] if unit == "rad" else np.degrees(std[:, 3:]), rtol=1e-6)
-
-
-# --- a model in a new place: --free, and errors that are named as motions without it ---
 
 
 MOVE = twist_transform(torch.tensor([0.01, -0.02, 0.005, 0.004, -0.003, 0.006], dtype=torch.float64))

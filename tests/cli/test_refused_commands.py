@@ -65,7 +65,6 @@ def given(*words: str, edit: Edit = as_written) -> tuple[Sequence[str], Edit]:
 REFUSED = {
     r"--sep and --decimal: expected different characters.*--sep ';'": given("--sep", ","),
     r"no link 'hand'.*its links are base_link, .*flange": given("--tip", "hand"),
-    r"did you mean 'flange'": given("--tip", "flnage"),
     r"--position: .* in one way, got x, y and z and zenith_gon": given("--position", "zenith_gon=x,y,z"),
     r"--tip: expected 1, one for each --position, got 2": given("--tip", "flange", "--tip", "wrist_link"),
     r"no moving joint from 'output_link' to 'flange'": given("--base", "output_link"),
@@ -78,7 +77,6 @@ REFUSED = {
     r"--rotation is given, but its --convention is not: expected 'rotvec'": given("--rotation", "a,b,c", edit=turned),
     r"--rotation-angle is missing: the unit of the rotation: expected 'rad'": given(*ROTATION[:4], edit=turned),
     r"--lever without --rotation": given("--lever", "100"),
-    r"--rotation-std without --rotation": given("--rotation-std", "a,b,c"),
     r"--std: expected names of columns: one, one per marker or three per": given("--std", "a,b"),
     r"`lever`.*above 0, got -0.005": given("--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5", edit=turned),
     r"line 5, column 'my': expected a number, got 'far'": given(edit=set_cell(4, 7, "far")),

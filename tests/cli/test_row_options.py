@@ -94,8 +94,6 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
-        (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
-        (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),

@@ -95,18 +95,6 @@ def test_old_files_stay_where_the_disk_is_full(name: str, small_site: Site, soun
     assert written(tmp_path) == old
 
 
-def test_ctrl_c_before_there_is_a_model_is_exit_130(site: Site, command: Command, tmp_path: Path) -> None:
-    def interrupted(*_: Any, **__: Any) -> None:
-        raise KeyboardInterrupt
-
-    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", interrupted)
-    done = command(*site.fit(site.csv, tmp_path / "none.safetensors"))
-    assert done.code == 130
-    assert not (tmp_path / "none.safetensors").exists()
-    assert "interrupted" in done.err
-    assert "Traceback" not in done.err
-
-
 @pytest.mark.parametrize("seconds", [0.1, 0.6])
 def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_path: Path) -> None:
     """The program has begun, its imports have not ended: one sentence at once, no traceback."""

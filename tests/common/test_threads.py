@@ -37,9 +37,6 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
     assert 2 in before
 
 
-# --- torch -------------------------------------------------------------------------------------------------------
-
-
 def test_small_work_has_one_thread_and_large_work_inside_has_all() -> None:
     with torch_threads(3):
         with small_work():

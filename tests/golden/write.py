@@ -121,9 +121,6 @@ def upwards(value: float) -> float:
     return float(f"{ceil(value / unit - 1e-9) * unit:.0e}")
 
 
-# --- numbers of a calibration -----------------------------------------------------------------------------------------
-
-
 def computed(name: str, shake: int | None = None) -> dict[str, Entry]:
     """All numbers of a case; ``shake``: seed of changes of the measured numbers by their last digit."""
     kind = kind_named(name)

@@ -66,9 +66,6 @@ def arm(files: CFiles) -> CModel:
     return CModel(files.source, 6, 2)
 
 
-# --- Results ------------------------------------------------------------------------------------------------------
-
-
 @needs_compiler
 def test_results_are_in_the_base_frame_and_periodic(model: dc.CalibratedKinematics, arm: CModel) -> None:
     """Tables continue periodically, at their ends too."""
@@ -96,9 +93,6 @@ def test_no_numbers_from_none(arm: CModel) -> None:
             after, error = arm.newton_step(q[0], np.eye(4))
             assert np.isnan(error)
             assert np.isnan(after).all()
-
-
-# --- The Newton step: trust region, joint limits, singularities ---------------------------------------------------
 
 
 def pose_at(made: CModel, q: np.ndarray) -> np.ndarray:
@@ -157,17 +151,6 @@ def test_a_bounded_step_is_the_best_of_its_length(arm: CModel, weight: float, bo
 
 
 @needs_compiler
-@pytest.mark.parametrize("angle", [1e-9, 0.3, 3.0, np.pi - 1e-7, np.pi])
-def test_errors_of_large_rotations(arm: CModel, angle: float) -> None:
-    """Up to half a turn, where the rotation vector is hard to read from the matrix."""
-    start = pose_at(arm, HOME)
-    for axis in [*np.eye(3), *draw(10, 3, seed=2).numpy()]:
-        target = start.copy()
-        target[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix() @ start[:3, :3]
-        np.testing.assert_allclose(arm.newton_step(HOME, target, weight=2.0)[1], 2.0 * angle, rtol=1e-7, atol=1e-14)
-
-
-@needs_compiler
 def test_joints_stop_at_their_limits(arm: CModel) -> None:
     """The rest of the joints then does its best: the gradient in these vanishes in the end."""
     wanted = HOME.copy()
@@ -198,9 +181,6 @@ def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(target, model.tool_poses(goal, tool, "measuring"), rtol=0, atol=1e-12)
     np.testing.assert_allclose(made.points(goal.numpy()), model(goal), rtol=0, atol=1e-12)
     assert errors_of_steps(made, 0.1 * np.ones(chain.n), target[0], 10)[-1] < 1e-13
-
-
-# --- The files ----------------------------------------------------------------------------------------------------
 
 
 @needs_compiler

@@ -186,9 +186,6 @@ def test_the_tip_of_the_tool_is_named(tmp_path: Path) -> None:
     assert "frame of the tip right" in files.header.read_text()
 
 
-# --- Tables of periodic functions ---------------------------------------------------------------------------------
-
-
 def periodic_sum(profile: str, lengthscale: float = 0.3, count: int = 40) -> PeriodicSum:
     """A sum with angles over several turns, some of them equal."""
     rng = np.random.default_rng(0)

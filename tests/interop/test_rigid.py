@@ -166,22 +166,6 @@ def test_rigid_kinematics_made_for_the_tables_are_better_with_them(arm: Case) ->
     assert again.rms == pytest.approx(made.rms, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_slides(slider: Case, tmp_path: Path) -> None:
-    table = correction_tables(slider.model, slide_step=0.002)[2]
-    assert (table.joint, table.turns) == ("slide", False)
-    truth = 4e-4 * (2 * math.pi / 0.3 * table.values).sin()
-    away = table.errors - truth
-    assert float((away - away.mean()).square().mean().sqrt()) < 1e-4
-    write_correction_tables(slider.model, tmp_path / "t.csv", length="mm", angle="deg")
-    rows = [row for row in read(tmp_path / "t.csv") if row["joint"] == "slide"]
-    assert {row["unit"] for row in rows} == {"mm"}
-    assert float(rows[-1]["value"]) == pytest.approx(1e3 * float(table.values[-1]), rel=1e-15)
-    write_joint_offsets(slider.model, tmp_path / "o.csv", length="mm", angle="deg")
-    units = [row["unit"] for row in read(tmp_path / "o.csv")]
-    assert units == ["deg", "deg", "mm", "deg", "deg", "deg"]
-
-
 def test_wrong_options(arm: Case, tmp_path: Path) -> None:
     for step in (0.0, -1.0, math.nan, True, "1"):
         with pytest.raises(InputError, match="`turn_step`: expected a number above 0"):

@@ -104,7 +104,6 @@ def test_refusals() -> None:
         (one, {"output": "poses"}, "calibrated with points"),
         (one, {"tool": TOOL}, "`tool` was given: expected output=\"tool_poses\", got 'points'"),
         (one, {"output": "tool_poses", "frame": "world"}, "`frame`: expected 'base' or 'measuring'"),
-        (one, {"dtype": torch.float16}, "`dtype`"),
         (plain, {"dtype": torch.float32}, r"expected torch\.float64, got torch\.float32"),
         (plain, {"output": "tool_poses"}, "expected 'points', got 'tool_poses'"),
         (stepped, {}, r"expected dc\.RK4 or dc\.RK8, got TorchDiffEq"),

@@ -108,9 +108,6 @@ def test_a_model_brings_its_own_urdf(tmp_path: Path) -> None:
     )
 
 
-# --- wrong input ---------------------------------------------------------------------------------------------------
-
-
 def test_a_robot_without_urdf(tmp_path: Path) -> None:
     chain = dc.from_dh([(0.1, 0.2, 0.3), (0.1, 0, 0)])
     with pytest.raises(InputError, match=r"'robot' does not hold the URDF that it was fitted with; pass the file"):

@@ -71,9 +71,6 @@ def test_a_killed_rank_is_an_error_in_the_other(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# --- In one process ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("formula", [FIELD, GRADIENT])
 def test_shares_add_up(count: int, formula: Formula) -> None:

@@ -83,9 +83,6 @@ def test_tiled_sums_replace_keops_where_gradients_are_needed(live: int) -> None:
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=1e-12)
 
 
-# --- The environment ----------------------------------------------------------------------------------------------
-
-
 def in_a_process(code: str, **environment: str) -> Any:
     """Run code in a separate process with these variables, without the user's for KeOps; return its output as JSON."""
     kept = {k: v for k, v in os.environ.items() if k not in ("CXX", "CXXFLAGS", "KEOPS_CACHE_FOLDER")}

@@ -163,9 +163,6 @@ def test_a_wrong_profile_is_refused(profile: Profile, words: str) -> None:
         RadialKernel(profile)
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
-
-
 def nominal(x: Tensor) -> Tensor:
     return torch.stack([x[:, 0], x[:, 1], x.sin().sum(1)], 1)
 

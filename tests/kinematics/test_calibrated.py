@@ -18,8 +18,6 @@ from diffeo_calib.measurements.poses import angle_between, mark_jacobian, mark_p
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
 
-# --- prediction -----------------------------------------------------------------------------------------------------
-
 
 def test_covariance_is_that_of_the_tangent_model_written_out(arm: Case) -> None:
     """Deformations of a millimetre change the covariance by about a permille; a missing term would change it more."""
@@ -68,9 +66,6 @@ def test_errors_that_the_fields_do_not_resolve(arm: Case, tmp_path: Path) -> Non
     assert dc.load(tmp_path / "model.safetensors").map.unresolved.equal(variances)
 
 
-# --- inverse --------------------------------------------------------------------------------------------------------
-
-
 def test_inverse_reaches_its_targets(arm: Case) -> None:
     wanted = arm.test.q[:30]
     targets = arm.model(wanted)
@@ -93,9 +88,6 @@ def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
     before = (truth.true_points(commanded) - targets).norm(dim=-1).square().mean().sqrt()
     after = (truth.true_points(q) - targets).norm(dim=-1).square().mean().sqrt()
     assert float(after) < 0.1 * float(before)
-
-
-# --- input ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_rows(arm: Case) -> None:
@@ -140,9 +132,6 @@ def test_large_batches_equal_small_ones_and_full_turns_change_nothing(arm: Case)
     covariance = arm.model.predict(q[:200])[1]
     singly = torch.cat([arm.model.predict(row[None])[1] for row in q[:200:40]])
     assert_close(covariance[::40], singly, rtol=1e-6, atol=1e-16)
-
-
-# --- the poses of calibrated kinematics: their fit to three points, covariances and inverse -------------------------
 
 
 def test_poses_fit_the_points_of_the_model(posed: Case) -> None:

@@ -81,9 +81,6 @@ def test_data_frames_that_cannot_be_taken(table: Table, arm: Case) -> None:
         arm.model(twice)
 
 
-# --- results as data frames of pandas -------------------------------------------------------------------------------
-
-
 def test_errors_of_every_row(pair: Case) -> None:
     data = pair.test[5:25]
     found = dc.evaluate(pair.model, data)

@@ -35,9 +35,6 @@ def test_numbers_are_numpy_s(rows: int, markers: int) -> None:
         assert value == pytest.approx(float(np.quantile(distances, share)), rel=1e-12)
 
 
-# --- poses ----------------------------------------------------------------------------------------------------------
-
-
 def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
     """Poses with errors: shifts in m, turns in rad."""
     rotations = rotation_matrices(vectors, "rotvec") @ poses[:, :3, :3]
@@ -83,9 +80,6 @@ def test_predictions_that_do_not_fit_the_rows(posed: Case, arm: Case) -> None:
         dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)
 
 
-# --- calibrated models ----------------------------------------------------------------------------------------------
-
-
 def test_rows_of_the_fit_are_recognised_up_to_rounding(arm: Case) -> None:
     fitted, others = arm.train.q, arm.test.q
     mixed = torch.cat([others[:2], fitted[5:8] + 1e-10, fitted[5:6] + 1e-8])
@@ -123,9 +117,6 @@ def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
         warn_outside_range(arm.model, q)
     assert record[0].filename == __file__
-
-
-# --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------
 
 
 def in_other_unit(rows: Any, factor: float) -> Any:

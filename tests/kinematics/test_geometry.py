@@ -97,9 +97,6 @@ def test_wrong_input_is_explained(chain: Chain) -> None:
         replace(Geometry.nominal(CHAIN), joint_errors=eye.repeat(3, 1, 1))
 
 
-# --- the nominal map of a robot ---------------------------------------------------------------------------------------
-
-
 @every_chain
 def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
     """Row by row, with the sum of the error twists of parameters and deflection."""
@@ -110,9 +107,6 @@ def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
         errors = theta[: geometry.size].clone()
         errors[geometry.slices["joints"]] += GravitySag(chain).twists(row[None], w).flatten()
         assert_close(value, geometry.points(row[None], errors).flatten(), rtol=1e-13, atol=1e-14)
-
-
-# --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
 
 
 def test_a_wave_turns_its_joint_and_nothing_else() -> None:

@@ -103,8 +103,6 @@ def test_wrong_tools_and_frames(arm: Case) -> None:
             arm.model.tool_poses(arm.test.q, tool, frame)
 
 
-# --- apart from where the base stands and how the tool is mounted ---------------------------------------------------
-
 TOOL = tool_transform([0.15, -0.12, 0.16])
 STEP = 1e-5
 

@@ -54,9 +54,6 @@ def test_a_map_knows_its_measurements(reduced: bool) -> None:
     torch.testing.assert_close(again.model(new), fitted.model(new), rtol=0.0, atol=1e-4)
 
 
-# --- coordinates that were not measured ---------------------------------------------------------------------------
-
-
 def gaps(rows: int = 9, m: int = 6) -> tuple[Tensor, Tensor]:
     """Random blocks, and which coordinates of them were measured."""
     root = normal(rows, m, m, seed=5)

@@ -45,8 +45,6 @@ def test_values_at_the_controls_are_those_of_the_fit() -> None:
         assert other.at_controls(at) is None
 
 
-# --- rows of several kinds ----------------------------------------------------------------------------------------
-
 N, M, R = 7, 6, 3
 Z = normal(N, M, seed=1)
 LENGTHS, HEIGHTS = torch.tensor([4, 0, 2]), torch.tensor([1, 6])

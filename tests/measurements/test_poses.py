@@ -42,9 +42,6 @@ def turn(axis: str, angle: float) -> np.ndarray:
     return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
 
 
-# --- conventions ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("angle", ["rad", "deg"])
 def test_round_trips(angle: str) -> None:
     matrices = random_rotations(50)
@@ -127,9 +124,6 @@ def test_angles_between_rotations(size: float) -> None:
     assert float(angle_between(R, R).max()) < 1e-15
 
 
-# --- poses as points ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("lever", [0.001, 0.1, 3.0])
 def test_points_are_an_equilateral_triangle_around_the_origin_and_lead_back(lever: float) -> None:
     poses = random_poses(20)
@@ -175,8 +169,6 @@ def test_rounded_transforms_become_rigid() -> None:
     assert_close(found, poses, rtol=0, atol=2e-5)
     assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
 
-
-# --- derivatives ----------------------------------------------------------------------------------
 
 ROWS, STEP = 6, 1e-6
 

@@ -126,16 +126,6 @@ def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
 
 
-def test_cells_of_texts_are_a_column(tmp_path: Path) -> None:
-    """And not those that hold something else."""
-    own = {"day": np.array(["mon", "tuesday"], dtype=object), "all": np.array([{"a": 1.0}, "b"], dtype=object)}
-    savemat(tmp_path / "t.mat", {"q": JOINTS[:2], **own})
-    file = CsvLines(tmp_path / "t.mat", ",")
-    assert file.header == ["q_1", "q_2", "day"]
-    assert [cells[2] for _, cells in file.rows()] == ["mon", "tuesday"]
-    assert file.notes == ["arrays all left out: no numbers or texts of 2 rows"]
-
-
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "one array of one axis": ("t.npy", lambda path: np.save(path, ROWS[0]), "of shape .5,."),
     "objects": ("t.npy", lambda path: np.save(path, np.array([{}, []], dtype=object)), "cannot be read"),

@@ -15,8 +15,6 @@ from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.nominal import as_nominal
 from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem
 
-# --- A second implementation: loops over points and components in numpy; the constants of section 5 are typed here ----
-
 
 def k_v(d: np.ndarray) -> float:
     return 8.0 * float(np.exp(1.0186 * (np.cos(d) - 1.0).sum()))
@@ -133,9 +131,6 @@ def test_gradient_against_finite_differences(equations: Eulerian, integrator: In
     direction, h = normal(7, 2, seed=6), 1e-5
     difference = float(energy(P0 + h * direction) - energy(P0 - h * direction)) / (2 * h)
     assert float((found[1] * direction).sum()) == pytest.approx(difference, rel=tolerance)
-
-
-# --- Beside the exact model -------------------------------------------------------------------------------------------
 
 
 def test_agrees_with_the_exact_model_to_first_order() -> None:

@@ -53,9 +53,6 @@ def test_wrong_arguments_are_one_clear_error(arguments: dict[str, object], messa
         dc.fit(few_points(), integrator=dc.RK4(1), **arguments)  # pyright: ignore[reportArgumentType]
 
 
-# --- the paper's two algorithms and its test bed ----------------------------------------------------------------------
-
-
 STEP = 0.05
 
 
@@ -71,9 +68,6 @@ def test_algorithm_1_is_gradient_descent_from_zero() -> None:
     assert not result[1].requires_grad
     settled = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e6, 12))
     assert not bool(settled[1].any())  # the tolerance is met at once
-
-
-# --- gradient descent with a fixed step -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
