@@ -24,7 +24,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
 from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
 from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm

@@ -18,10 +18,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
-from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.sockets import SocketDevices, other_socket
+from diffeo_calib.calibration.placing.readings import SocketDevices, other_socket
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
@@ -88,12 +86,7 @@ def test_places_left_out_by_leaving_them_out(data: SocketReadings, placed: Place
     predicted = (
         torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]] - tangent.target[gone]
     )
-    middles = {int(s): predicted[socket[gone] == s].mean(0) for s in socket[gone].unique()}
-    spread = torch.stack([p - middles[int(s)] for p, s in zip(predicted, socket[gone], strict=True)])
-    found = devices._left_out(chosen)[2]
-    assert found.spread == pytest.approx(float(spread.square().sum(1).mean().sqrt()), rel=1e-6)
-    first, second = middles.values()
-    assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
+    torch.testing.assert_close(devices.left_out(chosen)[own], predicted, rtol=0, atol=1e-9)
 
 
 def test_deviations_grow_where_places_contradict_each_other(data: SocketReadings, placed: Placed) -> None:
@@ -154,7 +147,10 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         return lambda: place(plain.nominal, data, silent)
 
     refused(
-        (r"at least 2 rows in every socket.*, got '2/1' in 1 row", staged(table(some).rows(slice(0, 31)))),
+        (
+            r"sockets: expected at least 2 rows with each name, got '2/1' in 1 row",
+            staged(table(some).rows(slice(0, 31))),
+        ),
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
@@ -196,21 +192,6 @@ def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: Sock
     names = tuple(some.names[(7 * row) % 36] for row in range(36))
     with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
         place(plain.nominal, table(some, names), silent)
-
-
-def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:
-    def still(q: torch.Tensor) -> torch.Tensor:
-        return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
-
-    def upright(q: torch.Tensor) -> torch.Tensor:
-        q[:, 0] += torch.linspace(-0.8, 0.8, 12, dtype=q.dtype)
-        return q
-
-    for change, expect in ((still, pytest.raises(MeasurementError, match="the tool hardly turns")),
-                           (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
-        data = dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
-        with expect:
-            check_socket_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.device))
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:

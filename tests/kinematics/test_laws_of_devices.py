@@ -220,7 +220,7 @@ def test_what_is_refused() -> None:
     with pytest.raises(MeasurementError, match="expected distances of left, right, got heights of left, right"):
         devices.errors(exact(Planes)[1], points)
     rows = [*range(0, 60, 2), 1, 3, 5]
-    with pytest.raises(MeasurementError, match="at least 8 rows of each device, got 'right' in 3 rows"):
+    with pytest.raises(MeasurementError, match="at least 8 rows with each name, got 'right' in 3 rows"):
         placed(data.rows(rows), points[rows, None])
     for wrong, size, focal in (("`focal`", 2, 0.0), ("pixels", 3, 1.0)):
         with pytest.raises(MeasurementError, match=wrong):
