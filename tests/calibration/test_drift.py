@@ -19,6 +19,8 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.placing.sessions import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.measurements.csv.files import read_observations, write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.sensors.known_drift import KnownDrift
 
@@ -142,6 +144,17 @@ def test_beyond_its_rows_a_drift_stays_as_at_the_end(drifted: Any) -> None:
     for end in known.ends["time"]:  # the rows of the fit reach them
         there = drifted[1].with_covariates(time=torch.full((60,), end, dtype=torch.float64))
         assert not [line for line in known.in_rows(there) if "outside" in line]
+
+
+def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
+    (q, points), columns = ARM.measure(12, seed=1), {"time": hours(12), "temperature": 20.0 + hours(12)}
+    data: Any = dc.Measurements(q, points, ARM.nominal.joint_names).with_covariates(**columns)
+    both: Any = dc.Observations.joined([data, readings(ARM, "height", 12).with_covariates(**columns)])
+    for rows in (data, both):
+        form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
+        read: Any = read_observations(tmp_path / "t.csv", form)
+        assert read.covariate_names == ("time", "temperature")
+        assert_close(read.rows([3, 1]).covariates, rows.covariates[[3, 1]], rtol=1e-12, atol=0)
 
 
 def test_columns_that_cannot_be() -> None:

@@ -15,13 +15,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.choose_scales import scales_of_models
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.position_errors import _fall, _Scan, find_gear_lines, with_axis_errors
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.scales import TRANSMISSION_PROFILE, Hyperparameters, axis_deviations
+from diffeo_calib.process.scales import DEVIATIONS, SCALES, TRANSMISSION_PROFILE, Hyperparameters, axis_deviations
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import from_dh
@@ -35,6 +36,15 @@ def test_scales_are_those_of_the_other_model_but_for_one_factor() -> None:
     factor = float(found.scales.sensor_noise / kind.scales.sensor_noise)
     assert_close(found.scales.vector, kind.scales.inflated(factor).vector, rtol=1e-9, atol=0)
     assert "1 other model" in found.status
+
+
+def test_means_are_quadratic_of_deviations_and_geometric_of_others() -> None:
+    scales, model = kind_named("positions").scales, kind_named("positions").model
+    mean = scales_of_models([model, model.changed(scales=scales.vector * 7.0)], scales)
+    for name in SCALES:
+        assert_close(
+            getattr(mean, name), (5.0 if name in DEVIATIONS else 7.0**0.5) * getattr(scales, name), rtol=1e-9, atol=0
+        )
 
 
 def test_unusable_models_are_refused() -> None:

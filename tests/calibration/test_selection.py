@@ -20,6 +20,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.noise_model import differing_factor
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -92,6 +93,15 @@ def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
     found = log_posterior(scales.logarithms(), setting.scales, data)
     assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)
     assert found.prior == pytest.approx(log_prior(scales, setting.scales), rel=1e-9)
+
+
+def test_three_slides_whose_scales_change_together_count_once() -> None:
+    centre, data = of_places()
+    first = 2 * data.x.shape[1]  # of the coupled length scales
+    for count, expected in ((3, -0.5), (1, -0.5 * (1 / 9 + 6 / 9 / selection.AXES**2))):  # one alone hardly may
+        point = centre.logarithms()
+        point[first : first + count] += 0.2
+        assert log_posterior(point, centre, data).prior == pytest.approx(0.2**2 * expected)
 
 
 def of_places() -> tuple[dc.Hyperparameters, TangentData]:

@@ -1,5 +1,6 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
+import errno
 import http.client
 import io
 import json
@@ -108,6 +109,23 @@ def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(InputError, match="not the journal"):
             Journal(path)
+
+
+def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.csv"
+    table = GrowingTable(path)
+    table.append(*table.written({"a": 1}))
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left on device"):
+            table.append(*table.written({"a": 2}))
+    assert path.read_text() == "a\n1\n"
+    table.append(*table.written({"a": 3}))
+    assert table.new_lines() == [b"1\n", b"3\n"]
 
 
 def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
@@ -346,6 +364,20 @@ def test_pages_of_nothing_and_of_a_row(tmp_path: Path, run: Callable[..., tuple[
     assert len(clicked) == 3
     assert "header" in unreadable["error"]
     assert (taken["line"], rejected["accepted_rows"], len(repeated["next"])) == (2, 0, 1)
+
+
+def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    """A program that counts anew loses no row in silence, also after the campaign was started again."""
+    first = [row(0), row(1), row(2, id="two"), row(1), row(1, id="1"), row(2, id="two")]
+    other = [row(3, id=1), row(3, id="1"), row(3, id="two"), row(3, id=None), row(3, id="")]
+    for again in (0, 1):
+        done, answers = run([*first, *other])
+        assert done.code == 0
+        answers = answers[again:-1]
+        assert [one.get("line") for one in answers] == [2, 3, 4, 3, 3, 4, *5 * [None]]
+        assert all("whose values are others" in one["error"] for one in answers[6:9])
+        assert all("leave it out" in one["error"] for one in answers[9:])
+    assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
 
 
 def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:

@@ -165,6 +165,31 @@ def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
     assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
 
 
+def test_a_path(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
+    output = program.with_name("c")
+    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
+    assert done.code == 0
+    names = list(model.robot.joint_names)
+    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
+    assert np.abs(change).max() <= 0.01 + 1e-9
+    assert any("the corrections of the path jump" in line for line in done.warnings)
+
+
+def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -> None:
+    model, output = posed.model, program.with_name("corrected.csv")
+    dc.save(model, program.with_name("posed"))
+    given = "--tool", "measured:30,-20,150"
+    done = command("correct", program.with_name("posed"), program, *UNITS, *given, "-o", output)
+    assert done.code == 0, done.err
+    names = list(model.robot.joint_names)
+    before, after = (torch.from_numpy(np.radians(table(read(path), names))) for path in (program, output))
+    tool = model.measured_frame @ tool_transform([0.03, -0.02, 0.15])
+    reached = torch.tensor([row["status"] == "reached" for row in read(output)])
+    assert int(reached.sum()) >= 5
+    expected = (model.robot(before) @ tool)[reached]
+    torch.testing.assert_close(model.tool_poses(after, tool)[reached], expected, rtol=0, atol=1e-8)
+
+
 UNITS_OF_HANDS = ["--length", "mm", "--angle", "rad", "--limit", 20.0]
 TOOLS = [*(word for hand in HANDS for word in ("--tip", hand)), "--tool", "0,0,100", "--tool", "20,50,0"]
 PLACES = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)

@@ -42,8 +42,9 @@ def numbers_in(path: Path) -> tuple[list[str], np.ndarray]:
     return header.split(";"), np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
 
 
-def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command) -> None:
-    done = command("evaluate", path, site.csv, *TABLE)
+def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+    """Numbers of all rows, and the residuals of each: measured minus predicted."""
+    done = command("evaluate", path, site.csv, *TABLE, "-o", tmp_path / "r.csv")
     assert (done.code, done.err.strip()) == (0, "")
     assert model.provenance is not None
     assert model.provenance.table_sha256 == hashlib.sha256(site.csv.read_bytes()).hexdigest()
@@ -54,6 +55,12 @@ def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, comman
         found = dc.evaluate(model, data)
         expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
         assert done.numbers(label) == pytest.approx(expected, abs=1.01e-4)
+    _, *lines = (tmp_path / "r.csv").read_text().splitlines()
+    cells = np.array([line.replace(",", ".").split(";")[:9] for line in lines])[:, [0, 1, 5, 6, 7]].astype(float)
+    assert cells[:, 0].tolist() == list(range(2, 42))
+    assert cells[:, 1].sum() == 28
+    away = 1e3 * (site.data.points - model(site.data.q)).flatten(1).numpy()
+    np.testing.assert_allclose(cells[:, 2:], away, atol=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,17 @@ def test_a_bounded_step_is_the_best_of_its_length(arm: CModel, weight: float, bo
 
 
 @needs_compiler
+@pytest.mark.parametrize("angle", [1e-9, 0.3, 3.0, np.pi - 1e-7, np.pi])
+def test_errors_of_large_rotations(arm: CModel, angle: float) -> None:
+    """Up to half a turn, where the rotation vector is hard to read from the matrix."""
+    start = pose_at(arm, HOME)
+    for axis in [*np.eye(3), *draw(10, 3, seed=2).numpy()]:
+        target = start.copy()
+        target[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix() @ start[:3, :3]
+        np.testing.assert_allclose(arm.newton_step(HOME, target, weight=2.0)[1], 2.0 * angle, rtol=1e-7, atol=1e-14)
+
+
+@needs_compiler
 def test_joints_stop_at_their_limits(arm: CModel) -> None:
     """The rest of the joints then does its best: the gradient in these vanishes in the end."""
     wanted = HOME.copy()
@@ -166,6 +177,12 @@ def test_joints_stop_at_their_limits(arm: CModel) -> None:
     assert gradient[2] > 0  # it would go on
     assert (gradient * np.sign(q))[np.abs(q) == LIMIT].min() > 0
     assert np.abs(gradient[np.abs(q) < LIMIT]).max() < 1e-9
+    beyond = HOME + np.array([LIMIT + 0.01 - HOME[0], 0, 0, 0, 0, 0])  # it comes back, and the rest makes up for it
+    e, J = linearised(arm, beyond, pose_at(arm, beyond + 0.001), 0.1)
+    expected = np.linalg.lstsq(J[:, 1:], e + 0.01 * J[:, 0], rcond=None)[0]
+    after, _ = arm.newton_step(beyond, pose_at(arm, beyond + 0.001), bound=10.0)
+    assert after[0] == LIMIT
+    np.testing.assert_allclose(after[1:] - beyond[1:], expected, rtol=0, atol=1e-5)
 
 
 @needs_compiler

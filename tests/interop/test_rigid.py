@@ -131,6 +131,19 @@ def test_the_corrected_command_brings_the_joint_to_its_value(arm: Case) -> None:
         assert float(away) < 0.01 * float(table.errors.abs().max()) + 1e-9, "it is minus the error, to first order"
 
 
+def test_files_hold_tables_and_offsets_in_degrees(arm: Case, tmp_path: Path) -> None:
+    write_correction_tables(arm.model, tmp_path / "t.csv", angle="deg")
+    write_joint_offsets(arm.model, tmp_path / "o.csv", angle="deg")
+    for table in correction_tables(arm.model):
+        own = [row for row in read(tmp_path / "t.csv") if row["joint"] == table.joint]
+        written = [[float(row[name]) for name in ("value", "transmission_error", "correction_to_add")] for row in own]
+        assert {row["unit"] for row in own} == {"deg"}
+        expected = torch.stack([table.values, table.errors, table.corrections], 1)
+        torch.testing.assert_close(torch.tensor(written, dtype=torch.float64).deg2rad(), expected, rtol=1e-14, atol=0)
+    found = [math.radians(float(row["offset_to_add_to_reading"])) for row in read(tmp_path / "o.csv")]
+    assert found == pytest.approx(best_joint_offsets(arm.model).offsets.tolist(), rel=1e-14)
+
+
 def test_tables_cover_what_was_measured_and_say_how_good_interpolation_is(arm: Case) -> None:
     measured = arm.model.configurations
     for index, table in enumerate(correction_tables(arm.model, turn_step=0.1)):
