@@ -13,8 +13,11 @@ from two_arms_bank import HANDS, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.problem import joint_limits
+from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.build import calibrated_chain
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -116,6 +119,31 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize("axes", [3, 1, 0])
+def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int) -> None:
+    """By central differences, of rigid kinematics far from the targets, a free hand in two rows."""
+    rng, h, free = np.random.default_rng(1), 1e-5, np.zeros((6, 2), dtype=bool)
+    free[1, 0] = free[4, 1] = True
+    poses = twist_transform(torch.from_numpy(rng.standard_normal((6, 2, 6)))).numpy()
+    q = rng.uniform(-2, 2, (6, model.robot.n))
+    goal = Targets(poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :], 0.3, free)
+    errors = model.geometry.joint_errors.numpy()
+    chain = calibrated_chain(model.robot.arrays, np.eye(4), errors, np.zeros(6 + 6 * model.robot.moving))
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        there, jacobian = chain.poses_and_jacobian(at)
+        return -np.einsum("nkj,nk->nj", goal.slopes(jacobian), goal.errors(there))
+
+    here, jacobian = chain.poses_and_jacobian(q)
+    S = goal.slopes(jacobian)
+    hessian = S.swapaxes(1, 2) @ S + goal.curvature(jacobian, here)
+    for joint, step in enumerate(h * np.eye(q.shape[1])):
+        rise = goal.cost(chain.poses_and_jacobian(q + step)[0]) - goal.cost(chain.poses_and_jacobian(q - step)[0])
+        np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
+        change = (slope(q + step) - slope(q - step)) / (2 * h)
+        np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
+
+
 def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:
     """Three joints, the last of which follows others within its own limits."""
     frame = torch.eye(4, dtype=torch.float64)
@@ -131,3 +159,13 @@ def test_limits_of_a_mimic_joint_bind_its_driver() -> None:
     np.testing.assert_allclose(found.high, [2.0, 1.0])
     assert not len(found.matrix)
     assert np.isinf(joint_limits(parallelogram(), None).high).all()
+
+
+def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
+    found = joint_limits(limited({"j0": 1.0, "j1": 1.0}, 0.0, -1.0, 1.0), None)
+    start = np.array([[0.5, 0.4], [0.1, 0.1], [0.8, 0.8], [0.5, 0.5]])
+    q = start + np.array([[0.1, 0.1], [0.1, 0.1], [0.0, 0.0], [-0.1, 0.0]])
+    kept = found.within(start, q)
+    np.testing.assert_allclose(kept[0], [0.55, 0.45])
+    np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
+    assert np.isnan(kept[2]).all()
