@@ -84,7 +84,6 @@ def test_every_public_name_is_loaded_and_listed() -> None:
         "kinematics.transmission.NamedGearLine",
         "measurements.csv.sensors.ReadingColumns",
         "measurements.csv.sensors.SocketColumns",
-        "measurements.sockets.Sockets",
         "measurements.table_format.TableFormat",
     ],
 )

@@ -55,7 +55,7 @@ class Readings(RowGroups):
     NUMBERED = "device", "names"
     flattery = FLATTERY
     blocks = ()
-    """Known distances between devices, see :attr:`Sockets.blocks`."""
+    """Known distances between devices, see :attr:`SocketReadings.blocks`."""
 
     kind: str
     q: Tensor

@@ -24,78 +24,14 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 SEPARATOR = "/"
-"""Between the name of a place and that of a socket: "front/0"."""
+"""Between the name of a place and that of a socket: "front/0". A name without it is a place with one socket."""
 Distances = Mapping[tuple[str, str], float]
+NamedDistances = tuple[tuple[str, str, float], ...]
 KIND = "socket"
 FLATTERY = (
     "the spread within sockets is smaller than the true error: it contains neither errors that all rows of a socket "
     "share nor the robot's size, so that absolute errors are 2 to 6 times as large; do not compare models by it"
 )
-
-
-@dataclass(frozen=True)
-class Sockets:
-    """The sockets that hold the ball in some rows of a table.
-
-    Args:
-        names: S names, such as "front/0": that of the place, a slash, that of the socket at this place. A name without
-            a slash is a place with one socket.
-        distances: known distances, as numbers of two sockets and their distance [m].
-        distance_std: their standard deviation [m]; None without distances. The distance of two sockets of a block has
-            one error at all places.
-    """
-
-    names: tuple[str, ...]
-    distances: tuple[tuple[int, int, float], ...] = ()
-    distance_std: float | None = None
-
-    @classmethod
-    def of(cls, names: tuple[str, ...], distances: Distances | None, std: float | None) -> Sockets:
-        """Sockets with known distances [m], see :meth:`Measurements.from_sockets`."""
-        if distances is not None and not isinstance(distances, Mapping):
-            fix = 'pass {("0", "1"): 0.05} for sockets that are 50 mm apart'
-            raise MeasurementError.of("`distances`", expected="a dictionary", got=as_written(distances), fix=fix)
-        if not distances:
-            if std is not None:
-                what, fix = "`distance_std` without `distances`", "pass the distances, or leave it out"
-                raise MeasurementError.of(what, fix=fix)
-            return cls(names)
-        deviation = number_of(std)
-        if deviation is None or not 0.0 < deviation < inf:
-            fix = "pass how well the distances are known, such as 3e-5 for a printed block, measured with a caliper"
-            raise MeasurementError.of("`distance_std`", expected="a positive number in m", got=as_written(std), fix=fix)
-        lengths: dict[tuple[int, int], float] = {}
-        for pair, length in distances.items():
-            metres = number_of(length)
-            if metres is None or not 0.0 < metres < inf:
-                raise MeasurementError.of(f"the distance of {pair}", expected="metres above 0", got=as_written(length))
-            for both in _pairs(names, pair):
-                if lengths.setdefault(both, metres) != metres:
-                    where = " and ".join(names[number] for number in both)
-                    got = f"{lengths[both]:g} and {length:g} m"
-                    raise MeasurementError.of(f"the distance of {where}", expected="one value", got=got)
-        return cls(names, tuple((*both, length) for both, length in lengths.items()), deviation)
-
-    @property
-    def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
-        """Known distances by block: those of the same sockets at several places, which have one error in common."""
-        blocks: dict[tuple[str, str, float], list[tuple[int, int, float]]] = {}
-        for first, second, length in self.distances:
-            pair = sorted(self.names[number] for number in (first, second))
-            if _place(pair[0]) == _place(pair[1]):
-                pair = [name.rpartition(SEPARATOR)[2] for name in pair]
-            blocks.setdefault((pair[0], pair[1], length), []).append((first, second, length))
-        return [tuple(block) for block in blocks.values()]
-
-    @property
-    def place_names(self) -> tuple[str, ...]:
-        """Names of the places, in the order of their first socket."""
-        return tuple(dict.fromkeys(_place(name) for name in self.names))
-
-    @property
-    def place(self) -> Tensor:
-        """(S,) int64, the place of each socket."""
-        return numbers_of([_place(name) for name in self.names], self.place_names)
 
 
 @methods_outside_inference_mode
@@ -107,26 +43,42 @@ class SocketReadings(Readings):
 
     Args:
         distances: known distances [m] of two sockets by their names, also of sockets that no row shows.
-        distance_std: see :class:`Sockets`. Other arguments are those of :class:`Readings`; devices are sockets.
+        distance_std: their standard deviation [m]; None without distances. The distance of two sockets of a block has
+            one error at all places. Other arguments are those of :class:`Readings`; devices are sockets.
     """
 
     ALIKE = (*Readings.ALIKE, "distances", "distance_std")
     flattery = FLATTERY
 
-    distances: tuple[tuple[str, str, float], ...] = ()
+    distances: NamedDistances = ()
     distance_std: float | None = None
 
     @property
-    def sockets(self) -> Sockets:
-        """The sockets of these rows, and known distances between them."""
+    def lengths(self) -> list[tuple[int, int, float]]:
+        """Known distances [m] between sockets of these rows, by their numbers."""
         number = {name: number for number, name in enumerate(self.names)}
-        lengths = ((number[a], number[b], away) for a, b, away in self.distances if {a, b} <= number.keys())
-        return Sockets(self.names, tuple(lengths), self.distance_std)
+        return [(number[a], number[b], length) for a, b, length in self.distances if {a, b} <= number.keys()]
 
     @property
-    def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
-        """See :class:`Sockets`."""
-        return self.sockets.blocks
+    def blocks(self) -> list[list[tuple[int, int, float]]]:
+        """Known distances by block: those of the same sockets at several places, which have one error in common."""
+        blocks: dict[tuple[object, ...], list[tuple[int, int, float]]] = {}
+        for first, second, length in self.lengths:
+            pair = sorted(self.names[number] for number in (first, second))
+            if _place(pair[0]) == _place(pair[1]):
+                pair = [name.rpartition(SEPARATOR)[2] for name in pair]
+            blocks.setdefault((*pair, length), []).append((first, second, length))
+        return list(blocks.values())
+
+    @property
+    def place_names(self) -> tuple[str, ...]:
+        """Names of the places, in the order of their first socket."""
+        return tuple(dict.fromkeys(map(_place, self.names)))
+
+    @property
+    def place(self) -> Tensor:
+        """(S,) int64, the place of each socket."""
+        return numbers_of([*map(_place, self.names)], self.place_names)
 
     @property
     def socket_numbers(self) -> Tensor:
@@ -136,7 +88,7 @@ class SocketReadings(Readings):
     @property
     def places(self) -> Tensor:
         """(N,) int64, number of the place of each row's socket."""
-        return self.sockets.place[self.device]
+        return self.place[self.device]
 
     @property
     def points(self) -> Tensor:
@@ -180,21 +132,42 @@ class SocketReadings(Readings):
         return [(read_of_tool(self, CONTACT, self.values, self.device_names), *self.index)]
 
 
+def checked_distances(names: tuple[str, ...], distances: Distances | None, std: object) -> NamedDistances:
+    """Known distances [m] between sockets of these names, see :meth:`Measurements.from_sockets`."""
+    if distances is not None and not isinstance(distances, Mapping):
+        fix = 'pass {("0", "1"): 0.05} for sockets that are 50 mm apart'
+        raise MeasurementError.of("`distances`", expected="a dictionary", got=as_written(distances), fix=fix)
+    if not distances:
+        if std is not None:
+            raise MeasurementError.of("`distance_std` without `distances`", fix="pass the distances, or leave it out")
+        return ()
+    lengths: dict[tuple[str, str], float] = {}
+    for what, value in {
+        "`distance_std`": std,
+        **{f"the distance of {pair}": d for pair, d in distances.items()},
+    }.items():
+        if (metres := number_of(value)) is None or not 0.0 < metres < inf:
+            fix = "pass metres: known to 3e-5 in a printed block, measured with a caliper"
+            raise MeasurementError.of(what, expected="metres above 0", got=as_written(value), fix=fix)
+    for pair, length in distances.items():
+        for both in _pairs(names, pair):
+            if lengths.setdefault(both, float(length)) != length:
+                got, what = f"{lengths[both]:g} and {length:g} m", f"the distance of {' and '.join(both)}"
+                raise MeasurementError.of(what, expected="one value", got=got)
+    return tuple((*both, length) for both, length in lengths.items())
+
+
 def _place(name: str) -> str:
     return name.rpartition(SEPARATOR)[0] or name
 
 
-def _pairs(names: tuple[str, ...], pair: object) -> list[tuple[int, int]]:
-    """Numbers of the two sockets that a pair of names means, the smaller one first; one pair per place for sockets."""
+def _pairs(names: tuple[str, ...], pair: object) -> list[tuple[str, str]]:
+    """The two sockets that a pair of names means, in the order of ``names``; one pair per place for names at each."""
     given = tuple(str(name).strip() for name in pair) if isinstance(pair, (tuple, list)) else ()
-    numbers = {name: number for number, name in enumerate(names)}
     if len(given) == 2 and given[0] != given[1]:
-        if set(given) <= set(numbers):
-            return [(min(numbers[g] for g in given), max(numbers[g] for g in given))]
-        places = dict.fromkeys(_place(name) for name in names)
-        here = [[numbers.get(f"{place}{SEPARATOR}{socket}") for socket in given] for place in places]
-        both = [(min(a, b), max(a, b)) for a, b in here if a is not None and b is not None]
-        if both:
-            return both
+        places = ["", *(f"{place}{SEPARATOR}" for place in dict.fromkeys(map(_place, names)))]
+        each = [[name for name in names if name in (place + given[0], place + given[1])] for place in places]
+        if both := [(pair[0], pair[1]) for pair in each if len(pair) == 2]:
+            return both[:1] if len(each[0]) == 2 else both
     fix = f"pass two names of sockets; there are {listed(names) if names else few([])}"
     raise MeasurementError.of("a known distance", expected="names of two sockets", got=as_written(pair), fix=fix)

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.images import ONE_SESSION, ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import set_attributes, with_attributes
-from diffeo_calib.measurements.sockets import KIND, Distances, SocketReadings, Sockets
+from diffeo_calib.measurements.sockets import KIND, Distances, SocketReadings, checked_distances
 from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -196,10 +196,9 @@ class Measurements(ImageTable):
         """
         angles, joints = checks.joint_table(q, joint_names)
         numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
-        layout = Sockets.of(names, distances, distance_std)
-        apart = tuple((names[a], names[b], length) for a, b, length in layout.distances)
         zeros = torch.zeros(len(angles), 3, dtype=torch.float64, device=angles.device)
-        how: Any = {"joint_names": joints, "distances": apart, "distance_std": layout.distance_std}
+        apart = checked_distances(names, distances, distance_std)
+        how: Any = {"joint_names": joints, "distances": apart, "distance_std": distance_std and float(distance_std)}
         return SocketReadings(KIND, angles, zeros, numbers.to(HOST), names, **how).doubted(doubt)
 
     @classmethod

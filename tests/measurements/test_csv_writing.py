@@ -130,7 +130,7 @@ def assert_same(found: Any, wanted: Any) -> None:
         for name in ("on", "lever", "payload_at", "offset_std", "intrinsics"):
             assert getattr(own, name, None) == getattr(other, name, None), name
         if getattr(other, "sockets", None) is not None:
-            known = [[one.distance_std, *(d for *_, d in one.distances)] for one in (own.sockets, other.sockets)]
+            known = [[each.distance_std, *(d for *_, d in each.lengths)] for each in (own, other)]
             assert known[0] == pytest.approx(known[1])
 
 

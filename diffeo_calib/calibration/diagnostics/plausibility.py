@@ -473,14 +473,13 @@ def warn_of_wrong_sockets(data: SocketReadings, points: Tensor) -> None:
 
 def _check_distances(data: SocketReadings, fit: SocketRegistration) -> None:
     """Refuse known distances that are those of the robot in another unit, and warn of other ones."""
-    sockets = data.sockets
-    for first, second, length in sockets.distances:
+    for first, second, length in data.lengths:
         apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (data.device == first) | (data.device == second)
         off = max(float(values.median()) for values in (fit.distances, fit.distances[there]))  # as bent links leave it
         if abs(apart - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
             continue
-        what = f"the known distance of the sockets '{sockets.names[first]}' and '{sockets.names[second]}'"
+        what = f"the known distance of the sockets '{data.names[first]}' and '{data.names[second]}'"
         said = {"expected": f"about {1e3 * apart:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
         if in_other_unit(length / max(apart, 1e-9), gates.DISTANCE_SHARE):
             raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")

@@ -34,7 +34,7 @@ from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings, Sockets
+from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.geometry import Geometry
@@ -70,9 +70,9 @@ class SocketDevices(ReadingDevices):
     left_out: tuple[PlaceErrors, ...] = ()  # every place, predicted by all other rows
 
     @property
-    def sockets(self) -> Sockets:
+    def sockets(self) -> SocketReadings:
         """Their names and known distances."""
-        return with_attributes(self.data, names=self.names).sockets
+        return with_attributes(self.data, names=self.names)
 
     @property
     def positions(self) -> Tensor:
@@ -231,7 +231,7 @@ def register_ball(robot: Tree, tables: Sequence[Readings], tip: tuple[str, ...])
     bare, resting = Geometry.nominal(robot, 1, tip), resting_rows(tables)
     if resting is None:
         return register_readings(bare, tables)
-    if not resting.sockets.distances:
+    if not resting.lengths:
         what = "no distance between sockets is known: the size of the robot rests on its description"
         warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
     start = register_sockets(robot, resting.q, resting.device)

@@ -375,9 +375,10 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
         if "corners" in part.columns:
             columns.append(ImageColumns.of(part, session))
         elif part.kind == "socket":
-            sockets = part.sockets  # a reader finds these alone
-            distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}
-            columns.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
+            distances = {
+                (part.names[a], part.names[b]): length for a, b, length in part.lengths
+            }  # a reader finds these
+            columns.append(SocketColumns((SOCKET,), distances or None, part.distance_std, part.ball_tip))
         elif part.kind in ("position", "pose"):
             columns.append(None)
         else:
