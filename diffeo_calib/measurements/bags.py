@@ -209,9 +209,8 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
     except DiffeoCalibError:
         raise
     except Exception as error:  # rosbags raises errors of many kinds for damaged files
-        expected = "the folder of a ROS 2 bag, with metadata.yaml, or a ROS 1 file"
-        fix = "give the file of a ROS 1 bag, with a name that ends in .bag, or convert it with rosbags-convert"
-        raise InputError.of(f"{bag} cannot be read", expected=expected, got=str(error), fix=fix) from error
+        fix = "pass the folder of a ROS 2 bag, with metadata.yaml, or the .bag file of ROS 1, or use rosbags-convert"
+        raise InputError.of(f"{bag} cannot be read", got=str(error), fix=fix) from error
 
 
 def _time(message: Any, topic: str) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, methods_outside_inference_mode
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
@@ -70,12 +70,7 @@ class Observations(RowGroups):
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:
-        """The rows of several tables in order: :class:`Measurements`, :class:`Readings` or observations.
-
-        Raises:
-            MeasurementError: no table; tables that differ in joints or payloads; positions with other markers, poses
-                on other tips, other sockets, or a ball on another tip.
-        """
+        """The rows of several tables in order, see :meth:`Measurements.joined`."""
         return joined_tables(parts, apart=True)
 
     @property
@@ -144,12 +139,9 @@ class Observations(RowGroups):
 def _pieces(tables: Sequence[Any]) -> list[tuple[Any, Tensor]]:
     """The parts of all tables, each with its row numbers (M,), one table after another."""
     given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
-    if not given:
-        raise MeasurementError.of("tables to join", expected="at least one", got="none")
-    for table in given:
-        if not isinstance(table, RowGroups):
-            expected, got = "dc.Measurements, dc.Readings or Observations", type(table).__name__
-            raise MeasurementError.of("tables to join", expected=expected, got=got)
+    if not given or not all(isinstance(table, RowGroups) for table in given):
+        got = few([type(table).__name__ for table in given if not isinstance(table, RowGroups)])
+        raise MeasurementError.of("tables to join", expected="at least one of dc.Measurements or dc.Readings", got=got)
     pieces, start = [], 0
     for table in given:
         pieces += [(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
@@ -157,10 +149,16 @@ def _pieces(tables: Sequence[Any]) -> list[tuple[Any, Tensor]]:
     return pieces
 
 
+@outside_inference_mode
 def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
-    """The rows of several tables in order: one table of measurements or readings if it can hold them, unless ``apart``.
+    """The rows of several tables in order: :class:`Measurements` or :class:`Readings` if one table can hold them.
 
-    Rows of the same kind are one part.
+    These are rows with the same columns; rows of several kinds, and all with ``apart``, become :class:`Observations`.
+    Beside images of a board positions and rows in sockets become readings of points of the same tool, see
+    sensors/tool_frames.py.
+
+    Raises:
+        MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
     """
     pieces = _pieces(tables)
     if any("corners" in table.columns for table, _ in pieces):
@@ -186,6 +184,5 @@ def _check_joinable(tables: Sequence[Any]) -> None:
             ways.setdefault((table.kind, name), set()).add(table.column_kind)
     several = [f"{kind}s of '{name}'" for (kind, name), each in ways.items() if len(each) > 1]
     if several:
-        expected = "one kind of zero, lens, unit and known deviations for a device"
         fix = "name different devices differently, and give the deviations of all readings of a device, or of none"
-        raise MeasurementError.of(few(sorted(several)), expected=expected, got="several", fix=fix)
+        raise MeasurementError.of(few(sorted(several)), expected="one zero, lens and unit of a device", fix=fix)

@@ -15,15 +15,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.bodies import BALL, Bodies
 from diffeo_calib.measurements.images import ONE_SESSION, ImageTable
-from diffeo_calib.measurements.observations import Observations, joined_tables
-from diffeo_calib.measurements.readings import Readings, as_readings
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.readings import KIND, Distances, SocketReadings, as_readings, checked_distances
 from diffeo_calib.measurements.rows import set_attributes, with_attributes
-from diffeo_calib.measurements.sockets import KIND, Distances, SocketReadings, checked_distances
 from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -143,9 +142,9 @@ class Measurements(ImageTable):
             frames, board = pose_math.checked_frames(poses).to(angles.device), None
             if camera_on_tool:
                 if frames.shape[1] > 1:
-                    what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
-                    fix += " poses of the cameras in the board's frame"
-                    raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
+                    fix = "calibrate each arm with its own camera, or give the cameras' poses in the board's frame"
+                    what, got = "poses of a camera on the tool", frames.shape[1]
+                    raise MeasurementError.of(what, expected="one tip", got=got, fix=fix)
                 frames, board = pose_math.inverse_poses(frames), frames[:, 0, :3, 3]
             points = pose_math.points_of_frames(frames, lever)
         checks.check_rows(angles, frames, "poses")
@@ -201,17 +200,7 @@ class Measurements(ImageTable):
         how: Any = {"joint_names": joints, "distances": apart, "distance_std": distance_std and float(distance_std)}
         return SocketReadings(KIND, angles, zeros, numbers.to(HOST), names, **how).doubted(doubt)
 
-    @classmethod
-    def joined(cls, parts: Sequence[Measurements | Readings | Observations]) -> Any:
-        """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
-
-        These are rows with the same columns; rows of several kinds become :class:`Observations`. Beside images of a
-        board positions and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
-
-        Raises:
-            MeasurementError: tables that differ in joints, payloads, markers or known deviations.
-        """
-        return joined_tables(parts)
+    joined = staticmethod(joined_tables)
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """See :class:`RowGroups`; poses stay."""
@@ -385,10 +374,8 @@ class Measurements(ImageTable):
         """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""
         never = (~self.seen_bodies).all(0).nonzero()[:, 0].tolist()
         if never:
-            more = f" (and {len(never) - 1} more)" * (len(never) > 1)
-            what = f"{self.body_names[never[0]]}{more} is hidden in all {len(self)} rows"
-            fix = f"leave {'this marker' if self.lever is None else 'it'} out, or use rows that show it"
-            raise MeasurementError.of(what, expected="some row that shows it", fix=fix)
+            what, fix = few([self.body_names[body] for body in never]), "leave it out, or use rows that show it"
+            raise MeasurementError.of(f"{what}: hidden in all {len(self)} rows", fix=fix)
 
     @property
     def present_sessions(self) -> tuple[str, ...]:

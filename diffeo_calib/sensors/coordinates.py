@@ -17,9 +17,8 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET
-from diffeo_calib.measurements.sockets import KIND, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices

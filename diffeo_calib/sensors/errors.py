@@ -13,7 +13,7 @@ from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.quantiles import known, quantile
-from diffeo_calib.measurements.sockets import SocketReadings
+from diffeo_calib.measurements.readings import SocketReadings
 
 NAMES = ("rms", "median", "p95", "max")
 SIZES = ("RMS", "median", "95 %", "max")

@@ -27,7 +27,7 @@ from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, l
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.sockets import SocketReadings
+from diffeo_calib.measurements.readings import SocketReadings
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
@@ -257,7 +257,7 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
         ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
         ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
-        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={PAIR: 0.0})),
+        ("the distance of .* expected a positive number in m", lambda: wrong(some, distances={PAIR: 0.0})),
         (f"{pair}, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),

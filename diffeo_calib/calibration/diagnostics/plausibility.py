@@ -54,8 +54,7 @@ from diffeo_calib.common.errors import (
 from diffeo_calib.common.quantiles import chi2_median, known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_unit, rare_names
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import SocketReadings
+from diffeo_calib.measurements.readings import Readings, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen

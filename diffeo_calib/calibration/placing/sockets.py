@@ -32,9 +32,8 @@ from diffeo_calib.calibration.placing.placement import Elsewhere, Placement, See
 from diffeo_calib.calibration.placing.readings import ROBOT_BASE, ReadingDevices, ball_of_readings, register_readings
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, SEPARATOR, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.geometry import Geometry

@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import MeasurementError, few, listed, shown, war
 from diffeo_calib.common.files import as_path
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import Columns, check_count
+from diffeo_calib.measurements.csv.columns import POSITIONS, ROTATION_STD, ROTATIONS, STD, Columns, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
@@ -96,10 +96,8 @@ def _divided(rows: FileRows) -> list[tuple[SensorColumns, FileRows]]:
         raise MeasurementError.of(what, expected="some rows of this kind", fix="leave its columns out")
     empty = [rows.lines[row] for row in (~torch.stack(filled).any(0)).nonzero()[:, 0].tolist()]
     if empty:
-        what, words = f"file '{rows.path}', line {few(empty)}", [sensor.word for sensor in sensors]
-        fix, got = "fill in one of them, or remove the line", "neither" if len(words) == 2 else "none of them"
-        expected = " or ".join([", ".join(words[:-1]), words[-1]])
-        raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+        what, expected = f"file '{rows.path}', line {few(empty)}", " or ".join(sensor.word for sensor in sensors)
+        raise MeasurementError.of(what, expected=expected, got="empty cells", fix="fill them in, or remove the line")
     return [(sensor, rows.of(here)) for sensor, here in zip(sensors, filled, strict=True)]
 
 
@@ -248,7 +246,8 @@ def write_predictions(
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
     numeric = columns_of(table)
     sensor: PositionColumns = numeric.sensors[0]
-    of_bodies = [name for body in sensor.each for k in (0, 2, 1, 3) for name in body[k]]
+    order = POSITIONS, STD, ROTATIONS, ROTATION_STD
+    of_bodies = [column.name for body in sensor.each for role in order for column in body.of(role)]
     names = [*numeric.joints.columns, *of_bodies]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
@@ -336,9 +335,8 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     names = {name for part in whole.parts if part.kind != "socket" for name in part.device_names} - {""}
     board = None if device is None else device.board
     if table.camera_on_tool != (board is not None):
-        got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
-        fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
-        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
+        fix = "pass as it is with the measurements, and read the table with the same format"
+        raise MeasurementError.of("`camera_on_tool`", expected=board is not None, got=table.camera_on_tool, fix=fix)
     if table.session is not None and not names:
         raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
     if device is not None and device.corners is not None:

@@ -33,8 +33,6 @@ Column = Sequence[str] | Sequence[float]
 
 HEAD = 200
 """Lines among which the header is."""
-MOST_COLUMNS = 50_000
-"""Of a table of configurations."""
 NO_TABLES = {".json", ".yaml", ".yml", ".xml"}
 QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"
 """Quotation marks, dashes and the like in cp1252."""
@@ -91,9 +89,6 @@ class CsvLines:
         self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
         self._lists = _lists(lines := list(islice(self._cells(), HEAD)))
         lines = list(islice(self._cells(), HEAD)) if self._lists else lines
-        if (width := max((len(cells) for _, cells in lines), default=0)) > MOST_COLUMNS:
-            what, fix = f"file '{path}'", "check the separator (`sep`); one row is one configuration"
-            raise MeasurementError.of(what, expected=f"at most {MOST_COLUMNS} columns", got=width, fix=fix)
         each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
         if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True
@@ -127,9 +122,8 @@ class CsvLines:
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
         if bad:
-            what = f"file '{self.path}', line {few([line for line, _ in bad])}"
-            fix = "repair these lines (a cell that holds the separator must be quoted)"
-            raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
+            what, got = f"file '{self.path}', line {few([line for line, _ in bad])}", f"{bad[0][1]}; quote separators"
+            raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=got)
         if not kept:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
