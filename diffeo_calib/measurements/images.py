@@ -213,6 +213,20 @@ class ImageTable(RowGroups):
         columns = {name: getattr(table, name) for name in ("q", "poses", "points", "board")}
         return with_attributes(self, **columns, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
 
+    def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
+        """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ."""
+        pairs = [(camera, cameras.get(name)) for name, camera in self.cameras.items()]
+        if self.corners is None or not pairs or not all(old is not None and camera.alike(old) for camera, old in pairs):
+            return self
+        known = {name: cameras[name] for name in self.cameras}
+        names, on_tool = self.camera_names, self.board is not None
+        again = self.from_images(
+            self.q, self.corners, known, self.joint_names, seen_by=names, camera_on_tool=on_tool, doubt=False
+        )
+        columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
+        columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
+        return with_attributes(self, **columns)
+
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.
 

@@ -23,7 +23,7 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowGroups, set_attributes, with_attributes
+from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE, RowGroups, set_attributes, with_attributes
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -61,6 +61,8 @@ class Readings(RowGroups):
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
     NUMBERED = "device", "names"
     flattery = FLATTERY
+    fewest = FEWEST_PER_DEVICE
+    """Rows of a device from which its place is found."""
     blocks = ()
     """Known distances between devices, see :attr:`SocketReadings.blocks`."""
 
@@ -345,7 +347,7 @@ class SocketReadings(Readings):
     """
 
     ALIKE = (*Readings.ALIKE, "distances", "distance_std")
-    flattery = FLATTERY_OF_SOCKETS
+    flattery, fewest = FLATTERY_OF_SOCKETS, 2
 
     distances: NamedDistances = ()
     distance_std: float | None = None

@@ -187,13 +187,12 @@ READING_ROWS = 40
 """Below which single numbers say too little: a robot of six joints has some thirty geometric errors."""
 UNSEEN = 0.05
 """Motion of a reading, relative to that of a coordinate of the ball, below which it does not show a joint."""
-TURNED, TILTED = 0.02, 0.05
-"""Motion by turns of the tool, per unit of the ball's offset, below which its place is not determined along any
-direction, or along one."""
+TILTED = 0.05
+"""Motion by turns of the tool, per unit of the ball's offset, below which its place along a direction is open."""
 SIZE_SHARE = 0.8
 """Share of the expected error from which the robot's size is warned about."""
-SOCKET_ROWS, SOCKET_SURPLUS = 2, 6
-"""Rows of a socket, one says nothing since its place is not known; rows beyond the number of sockets."""
+SOCKET_SURPLUS = 6
+"""Rows in sockets beyond the number of these."""
 SOCKET_FAR = 0.02
 """Median distance of the ball from its socket that is doubted, as a part of the robot's reach."""
 DISTANCE_SHARE, DISTANCE_MEDIANS = 0.1, 5.0

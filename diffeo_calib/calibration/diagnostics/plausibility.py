@@ -25,7 +25,6 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     other_units,
     residual_of,
 )
-from diffeo_calib.calibration.diagnostics.open_directions import TILT
 from diffeo_calib.calibration.diagnostics.row_order import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
@@ -52,9 +51,9 @@ from diffeo_calib.common.errors import (
     warn_user,
 )
 from diffeo_calib.common.quantiles import chi2_median, known
-from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_unit, rare_names
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_unit
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.readings import Readings, SocketReadings
+from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen
@@ -99,43 +98,29 @@ def check_joints(robot: Tree, data: Any) -> None:
 
 
 def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> None:
-    """Refuse another tip than the robot has, and too few rows.
+    """Refuse another tip than the robot has, too few rows, and what does not go with sockets.
 
     Args:
         robot: n joints. tables: readings of one kind each. alone: whether no other rows tell of the robot.
     """
-    if not tables:
-        return
-    balls = [table for table in tables if not sees_frame(table)]
-    tip = balls[0].on if balls else robot.tips[0]
-    if tip is None and len(robot.tips) > 1:
+    tips = {table.on for table in tables if not sees_frame(table)}
+    if None in tips and len(robot.tips) > 1:
         fix = "name the tip that carries the ball (`with_tips`), or load the robot with that one"
         raise InputError.of("readings of a robot with several tips", expected="one", got=few(robot.tips), fix=fix)
-    if tip is not None and tip not in robot.tips:
+    for tip in tips - {None, *robot.tips}:
         raise InputError.of("the tip of the readings", expected=few(robot.tips), got=tip)
-    count = sum(map(len, tables))
-    if alone and count < gates.READING_ROWS:
-        fix = "measure more rows, better 150, or hold out fewer of them (--holdout)"
-        expected = f"at least {gates.READING_ROWS} rows"
-        raise MeasurementError.of("`readings`", expected=expected, got=count, fix=fix)
     for table in tables:
         check_devices(table)
-
-
-def check_sockets(robot: Tree, data: SocketReadings) -> None:
-    """Refuse rows in sockets that are too few, or measured in a way that does not go with them."""
-    if len(robot.tips) > 1:
-        raise MeasurementError.of("sockets", expected="a robot with one tip", got=few(robot.tips), fix="pass one `tip`")
-    check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
-    single = rare_names(data.device_names, data.line_numbers.tolist(), gates.SOCKET_ROWS)
-    if single:
-        expected = f"at least {gates.SOCKET_ROWS} rows in every socket, better 10 or more"
-        fix = "check the name, measure more rows there, with the tool turned and tilted otherwise, or leave it out"
-        raise MeasurementError.of("rows with sockets", expected=expected, got=few(single), fix=fix)
-    needed = len(data.names) + gates.SOCKET_SURPLUS
-    if len(data) < needed:
-        fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
-        raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(data), fix=fix)
+    resting = [table for table in tables if table.kind == KIND]
+    for table in resting:
+        check_unladen(table.payload, "rows with sockets", fix="leave the masses out; measure all with the same load")
+        needed = len(table.names) + gates.SOCKET_SURPLUS
+        if len(table) < needed:
+            fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
+            raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(table), fix=fix)
+    if alone and not resting and (count := sum(map(len, tables))) < gates.READING_ROWS:
+        fix, expected = "measure more rows, better 150, or hold out fewer of them (--holdout)", gates.READING_ROWS
+        raise MeasurementError.of("`readings`", expected=f"at least {expected} rows", got=count, fix=fix)
 
 
 def check_limits(robot: Tree, data: Any) -> None:
@@ -397,10 +382,10 @@ def check_markers(robot: Tree, data: Measurements) -> None:
 def check_socket_registration(
     robot: Tree, data: SocketReadings, fit: SocketRegistration, around: Geometry | None = None
 ) -> None:
-    """Refuse rows that fit with one mistake undone, or that do not determine where the ball is.
+    """Refuse rows that fit with one mistake undone, and known distances that are the robot's in another unit.
 
     Warns:
-        DiffeoCalibWarning: a ball in no socket, a tool that never tilted, a known distance that is not the robot's.
+        DiffeoCalibWarning: a ball in no socket, a known distance that is not the robot's.
 
     Args:
         robot: n joints. data: the rows. fit: their registration. around: the robot as a device saw it.
@@ -421,14 +406,18 @@ def check_socket_registration(
     said = {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
     otherwise = fix + "place and of the socket in it" if far else None
     check_fit(robot, data, median, what, **said, otherwise=otherwise, groups=tried, judge=left)
-    most, _, least = fit.tilt.tolist()
-    if most < gates.TURNED:
-        what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
-        raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
-    if least < gates.TILTED:
-        what = "the tool is never tilted in the sockets: the place of the ball along one direction is not determined"
-        warn_user(sentence(what, fix=TILT))
-    _check_distances(data, fit)
+    for first, second, length in data.lengths:
+        apart = float((fit.positions[first] - fit.positions[second]).norm())
+        there = (socket == first) | (socket == second)
+        off = max(float(values.median()) for values in (fit.distances, fit.distances[there]))  # as bent links leave it
+        if abs(apart - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
+            continue
+        what = f"the known distance of the sockets '{data.names[first]}' and '{data.names[second]}'"
+        said = {"expected": f"about {1e3 * apart:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
+        if in_other_unit(length / max(apart, 1e-9), gates.DISTANCE_SHARE):
+            raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")
+        fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
+        warn_user(sentence(what, **said, fix=fix))
 
 
 def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification, fit: SocketRegistration) -> None:
@@ -468,19 +457,3 @@ def warn_of_wrong_sockets(data: SocketReadings, points: Tensor) -> None:
     if len(rows) > gates.WRONG_SOCKETS * len(data):
         raise MeasurementError.of(what, fix="check the columns that name the place and the socket")
     warn_user(sentence(what, fix="check their sockets; they hardly count"))
-
-
-def _check_distances(data: SocketReadings, fit: SocketRegistration) -> None:
-    """Refuse known distances that are those of the robot in another unit, and warn of other ones."""
-    for first, second, length in data.lengths:
-        apart = float((fit.positions[first] - fit.positions[second]).norm())
-        there = (data.device == first) | (data.device == second)
-        off = max(float(values.median()) for values in (fit.distances, fit.distances[there]))  # as bent links leave it
-        if abs(apart - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
-            continue
-        what = f"the known distance of the sockets '{data.names[first]}' and '{data.names[second]}'"
-        said = {"expected": f"about {1e3 * apart:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
-        if in_other_unit(length / max(apart, 1e-9), gates.DISTANCE_SHARE):
-            raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")
-        fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
-        warn_user(sentence(what, **said, fix=fix))

@@ -13,7 +13,7 @@ import typer
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.diagnostics.judged_rows import check_errors
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, outlier_lines
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
