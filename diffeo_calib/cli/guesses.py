@@ -333,8 +333,7 @@ def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -
 
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-BELOW = (12, 13, 14)
-"""Places of the zeros below a rotation, of a matrix by rows."""
+BELOW = (12, 13, 14)  # places of the zeros below a rotation, of a matrix by rows
 
 
 class RowColumns(NamedTuple):

@@ -28,10 +28,8 @@ CHANNELS = {"mono8": [0], "8UC1": [0], "bgr8": [0, 1, 2], "8UC3": [0, 1, 2], "rg
 """Encodings of sensor_msgs/Image: where a pixel has its grey value, or blue, green and red."""
 SUFFIXES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"II*\0": ".tif", b"MM\0*": ".tif"}
 """First bytes of compressed images that `images` reads."""
-_Rows = list[list[float]]
-"""Times, s, each with values."""
-_Edge = tuple[str, str]
-"""Parent and child of a transform."""
+_Rows = list[list[float]]  # times, s, each with values
+_Edge = tuple[str, str]  # parent and child of a transform
 LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
 """The larger of these, s and median intervals, is the longest time between messages across which is interpolated."""
 

@@ -23,8 +23,7 @@ from diffeo_calib.common.data_frames import column_names, is_data_frame, named_c
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few
 
-LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
-"""Few axes turn further, so larger values are probably degrees."""
+LARGEST_JOINT_ANGLE_RAD = 4 * math.pi  # few axes turn further, so larger values are probably degrees
 USUAL_SIZES = {
     "angles": (LARGEST_JOINT_ANGLE_RAD, 2 * math.pi),
     "rotations": (2 * math.pi + 0.01, 2 * math.pi),
@@ -101,8 +100,7 @@ def numbered(names: object, rows: int, what: str = "the names of sessions") -> t
     return numbers_of(texts, distinct), distinct
 
 
-LARGEST_SI = 1e9
-"""Larger joint values or positions, rad or m, are no measurements."""
+LARGEST_SI = 1e9  # larger joint values or positions, rad or m, are no measurements
 
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:

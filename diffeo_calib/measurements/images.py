@@ -23,13 +23,11 @@ if TYPE_CHECKING:
 CAMERA_WARNED, CAMERA_REFUSED = 1.05, 5.0
 """Factors between the errors of corners with the given camera and with a free one, from which the images seem to show
 another camera. A focal length that is wrong by 1 % makes 1.06 of 60 images with errors of 0.2 px."""
-FEWEST_IMAGES = 8
-"""From which a free lens is well enough known to be compared."""
+FEWEST_IMAGES = 8  # from which a free lens is well enough known to be compared
 
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
-ONLY_CAMERA = "camera"
-"""Name of a camera that is alone."""
+ONLY_CAMERA = "camera"  # name of a camera that is alone
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 

@@ -17,8 +17,7 @@ from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
 
-WITH_POSITION = ("position", "pose")
-"""Kinds of rows of which a device measures positions."""
+WITH_POSITION = ("position", "pose")  # kinds of rows of which a device measures positions
 
 
 def _in_order(values: Sequence[Any], index: Sequence[Tensor]) -> Any:

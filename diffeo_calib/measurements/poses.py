@@ -23,10 +23,8 @@ from diffeo_calib.robots.se3 import ONE_POSE, TOLERANCE, Place, checked_rotation
 
 MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
-POINTS = 3
-"""Points that represent a frame."""
-FLATTEST_TRIANGLE_LEVERS = 1e-3
-"""Points whose triangle is thinner than this, in levers, have no orientation."""
+POINTS = 3  # points that represent a frame
+FLATTEST_TRIANGLE_LEVERS = 1e-3  # points whose triangle is thinner than this, in levers, have no orientation
 
 
 def marks(device: torch.device) -> Tensor:
@@ -71,10 +69,10 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
     return torch.as_tensor(rotation.as_matrix(), dtype=torch.float64, device=table.device)
 
 
-def readings_of(numbers: Tensor, *, angles: Sequence[str] = ANGLE_UNITS) -> Iterator[tuple[str, str, Tensor]]:
+def readings_of(numbers: Tensor) -> Iterator[tuple[str, str, Tensor]]:
     """Convention, unit and rotations (N, 3, 3) of numbers (N, k), in all conventions in which they write rotations."""
     for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == numbers.shape[1]):
-        for angle in angles if numbers.shape[1] == 3 else angles[:1]:
+        for angle in ANGLE_UNITS if numbers.shape[1] == 3 else ANGLE_UNITS[:1]:
             with suppress(InputError):
                 yield convention, angle, rotation_matrices(numbers, convention, angle=angle)
 

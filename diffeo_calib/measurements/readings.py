@@ -28,14 +28,12 @@ from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE, RowGroups, set_att
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-MILLIMETRES = "mm", 1e3
-"""Unit in which lengths are shown, and how many of it are a metre."""
+MILLIMETRES = "mm", 1e3  # unit in which lengths are shown, and how many of it are a metre
 FLATTERY = (
     "errors of readings are smaller than the true error: what no reading shows, such as the robot's size with devices "
     "that hold no length, is not in them; choose nothing by them"
 )
-ONE_DEVICE = "device"
-"""Name of the device of all rows, where none is given."""
+ONE_DEVICE = "device"  # name of the device of all rows, where none is given
 
 
 @methods_outside_inference_mode
@@ -61,10 +59,8 @@ class Readings(RowGroups):
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
     NUMBERED = "device", "names"
     flattery = FLATTERY
-    fewest = FEWEST_PER_DEVICE
-    """Rows of a device from which its place is found."""
-    blocks = ()
-    """Known distances between devices, see :attr:`SocketReadings.blocks`."""
+    fewest = FEWEST_PER_DEVICE  # rows of a device from which its place is found
+    blocks = ()  # known distances between devices, see :attr:`SocketReadings.blocks`
 
     kind: str
     q: Tensor
@@ -296,8 +292,7 @@ class Readings(RowGroups):
         return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
 
 
-MARKER, CONTACT = "marker", "contact"
-"""Kinds of readings of points of a tool whose poses are measured."""
+MARKER, CONTACT = "marker", "contact"  # kinds of readings of points of a tool whose poses are measured
 
 
 def read_of_tool(table: Any, kind: str, values: Tensor, names: Sequence[str], std: Tensor | None = None) -> Readings:

@@ -23,16 +23,11 @@ if TYPE_CHECKING:
     from diffeo_calib.robots.payload import Payload
 
 T = TypeVar("T")
-ON_HOST = ("line_numbers", "session", "device", "seen_by")
-"""Columns of numbers that stay on the host."""
-NO_SOCKET = -1
-"""Number of the socket of rows whose positions a device measured."""
-REPEAT_TOLERANCE = 1e-3
-"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
-FEWEST_PER_DEVICE = 8
-"""Rows of a device that reports readings, with which it can be placed."""
-CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
-"""Words for what a split keeps together."""
+ON_HOST = ("line_numbers", "session", "device", "seen_by")  # columns of numbers that stay on the host
+NO_SOCKET = -1  # number of the socket of rows whose positions a device measured
+REPEAT_TOLERANCE = 1e-3  # configurations closer than this in every joint [rad or m] are repeats of one another
+FEWEST_PER_DEVICE = 8  # rows of a device that reports readings, with which it can be placed
+CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"  # words for what a split keeps together
 
 
 def with_attributes(data: T, **attributes: object) -> T:
@@ -57,14 +52,11 @@ class RowGroups:
         covariates: (N, K) values with which something may drift, such as times and temperatures, in any unit.
     """
 
-    BY_ROW: ClassVar[tuple[str, ...]] = ()
-    """Attributes with a value for each row, all of them tensors (N, ...)."""
-    ALIKE: ClassVar[tuple[str, ...]] = ()
-    """Other attributes in which tables agree that are joined."""
+    BY_ROW: ClassVar[tuple[str, ...]] = ()  # attributes with a value for each row, all of them tensors (N, ...)
+    ALIKE: ClassVar[tuple[str, ...]] = ()  # other attributes in which tables agree that are joined
     NUMBERED: ClassVar[tuple[str, str]]
     """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-    flattery: ClassVar[str] = ""
-    """What errors of these rows do not show where no device measured a position."""
+    flattery: ClassVar[str] = ""  # what errors of these rows do not show where no device measured a position
 
     q: Tensor
     line_numbers: Tensor
@@ -75,11 +67,9 @@ class RowGroups:
     origin: object | None = None
     covariates: Tensor | None = None
     covariate_names: tuple[str, ...] = ()
-    without_device: bool = True
-    """Whether neither a position nor a pose was measured."""
+    without_device: bool = True  # whether neither a position nor a pose was measured
     kind: Any
-    compared: Any
-    """(N, c) numbers in which a row that repeats another one equals it."""
+    compared: Any  # (N, c) numbers in which a row that repeats another one equals it
     measured: Any
     """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
 
@@ -121,9 +111,7 @@ class RowGroups:
     def rows(self, index: object) -> Self:
         """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
 
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
+        IndexError for an index out of range, MeasurementError for an empty selection, or nothing that chooses rows.
         """
         chosen = checks.chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
@@ -310,8 +298,8 @@ class RowGroups:
         """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
 
         Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
-        repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
-        rows. A device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
+        repeats go in random order to ``train`` where that brings its size nearer to ``round(fraction * N)`` rows. A
+        device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
 
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
@@ -333,9 +321,7 @@ class RowGroups:
         """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
 
         Where some positions were measured, they cover these: rows in sockets are in every ``train``.
-
-        Raises:
-            MeasurementError: k below 2, or fewer distinct configurations than folds.
+        MeasurementError for k below 2, or fewer distinct configurations than folds.
         """
         if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
             raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")

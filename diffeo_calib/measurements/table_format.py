@@ -16,20 +16,16 @@ from typing import Any
 
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
 
-Names = Sequence[str] | Sequence[Sequence[str]]
-"""Names of columns: a list, or one for each marker or frame."""
+Names = Sequence[str] | Sequence[Sequence[str]]  # names of columns: a list, or one for each marker or frame
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
 """How many numbers write a rotation in each convention; an order of Euler angles takes three."""
 MAKERS = {"ur_rotvec": "rotvec", "abb_quaternion": "quat_wxyz", "kuka_abc": "ZYX", "fanuc_wpr": "xyz"}
 """Conventions by the names of controllers."""
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
-LEVER = 0.1
-"""Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
-ZERO = "0"
-"""In place of a column of z: all that was measured is in the plane of x and y."""
-UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
-"""A length in a file is divided by this."""
+LEVER = 0.1  # default distance [m] from a pose's origin to the three points that represent it: the size of usual tools
+ZERO = "0"  # in place of a column of z: all that was measured is in the plane of x and y
+UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}  # a length in a file is divided by this
 ROTATION_NAMES = {
     "rotvec": ("rx", "ry", "rz"),
     "quat_xyzw": ("qx", "qy", "qz", "qw"),
@@ -37,8 +33,7 @@ ROTATION_NAMES = {
     "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123"),
 }
 """Default names of the columns of a rotation that is written; euler1, ... for Euler angles."""
-SPHERICAL_UNITS = {"rad": 1.0, "deg": 180.0 / pi, "gon": 200.0 / pi}
-"""Units of the angles of devices, per rad."""
+SPHERICAL_UNITS = {"rad": 1.0, "deg": 180.0 / pi, "gon": 200.0 / pi}  # units of the angles of devices, per rad
 SPHERICAL = tuple(map("".join, product(("elevation", "zenith"), ("_", "_clockwise_"), SPHERICAL_UNITS)))
 """How a place is written as a distance, a horizontal angle, and one above the horizon, or from the zenith."""
 BESIDE = ("time", "temperature", "payload")

@@ -217,8 +217,8 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
         table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
-    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
-    assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
+    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
+    assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]
 
 
 def test_splits_hold_out_whole_places(some: SocketRows) -> None:

@@ -67,7 +67,7 @@ OPTIONS: list[Case] = [
     (TABLE, {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
     (TABLE, {"joints": "q1"}, "`joints` ... 'q1'"),
     (TABLE, {"joints": ["q1", "x"]}, "distinct columns, got ['x'] twice"),
-    (TABLE, {"position": [["x", "y", "z"]] * 2}, "distinct columns, got ['x'] twice"),
+    (TABLE, {"position": [["x", "y", "z"]] * 2}, "distinct columns, got ['x'"),
     (TABLE, {"position": "xyz"}, "`position`: expected three names"),
     (TABLE, {"position": [["x", "y", "z"], ["x", "y"]]}, "`position`"),
     (

@@ -23,8 +23,7 @@ from diffeo_calib.measurements.table_format import (
 )
 from diffeo_calib.robots.joint import KINDS
 
-PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}
-"""Units per rad or m; numbers without a unit are as they are."""
+PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}  # units per rad or m; numbers without a unit are as they are
 POSITIONS, ROTATIONS, STD, ROTATION_STD = "positions", "rotations", "std", "rotation_std"
 """Roles of the columns of a marker or frame."""
 

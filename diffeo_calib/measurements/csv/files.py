@@ -181,11 +181,7 @@ def read_measurements(
 
 
 def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
-    """Joint configurations (N, n), rad (revolute) and m (prismatic), from a CSV file, rows in the order of the file.
-
-    Errors and warnings are those of :func:`read_measurements`. Of the format only units, separator, decimal mark and
-    joints matter.
-    """
+    """Joint configurations (N, n), rad (revolute) and m (prismatic), of a file, see :func:`read_measurements`."""
     return read_configurations(path, table)["q"]
 
 
@@ -234,11 +230,9 @@ def write_predictions(
     Args:
         path: the file; it appears when the last block is written.
         blocks: configurations (B, n), rad and m; markers (B, P, 3), m, or poses (B, 4, 4) or (B, T, 4, 4), m; standard
-            deviations (B, P, 3), m, or (B, 6) or (B, T, 6): of positions, m, and of rotations about the measuring
-            frame's axes, rad; and more cells (B, k) as they are written.
-        table: the format, of poses with defaults as in :func:`write_measurements`.
-        prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
-        poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
+            deviations (B, P, 3) or (B, T, 6), m, and rad about the measuring axes; more cells (B, k) as written.
+        table: the format, of poses with defaults as in :func:`write_measurements`; columns: further fields of it.
+        prefixes: of the columns of each marker or frame. more: k further columns. poses: whether these are predicted.
     """
     position = [[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes]
     table = replace(table, **columns, position=position, spherical=None)
@@ -261,21 +255,18 @@ def write_predictions(
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
 
-SOCKET, SESSION = "socket", "session"
-"""Names of columns that are written."""
+SOCKET, SESSION = "socket", "session"  # names of columns that are written
 
 
 @outside_inference_mode
 def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat, **columns: Any) -> TableFormat:
     """Write a CSV file that :func:`read_measurements` or :func:`read_observations` reads back; overwrites.
 
-    In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations, payloads, covariates and names of set-ups and devices are written if they are known.
-    Cells are empty for hidden markers, and where a row of another kind has no value. Every row is one line.
+    In rad and m the round trip of joints and points is exact; in other units to the last digits of float64. All that is
+    known is written. Cells are empty for hidden markers, and where a row of another kind has no value.
 
     Args:
-        path: the file.
-        data: measurements, readings or observations, rad, m and pixels.
+        path: the file. data: measurements, readings or observations, rad, m and pixels.
         table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
             the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
             ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
@@ -287,12 +278,10 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
 
     Returns:
         the format of the file. Sockets are in the column ``socket``, readings in distance, displacement, height, or u
-        and v, with a number after it for a second table of the same kind. Known distances between sockets are not in
-        the file, but in this format.
+        and v, with a number after it for a second table of the same kind. Known distances are in this format alone.
 
     Raises:
-        MeasurementError: unknown unit, a number of names that does not match, names for something that the table
-            does not hold, or both positions and poses.
+        MeasurementError: names that do not match, or of what the table does not hold; both positions and poses.
         InputError: a file that cannot be written.
     """
     whole, table = Observations.joined([data]), replace(table, **columns)
@@ -371,7 +360,10 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
     columns, taken = list[Any](), list[str]()
     for part in whole.parts:
         if "corners" in part.columns:
-            columns.append(ImageColumns.of(part, session))
+            several, sizes = len(part.cameras) > 1, {name: (c.width, c.height) for name, c in part.cameras.items()}
+            set_ups = part.session_names and not (several and part.device_names == part.camera_names)
+            camera = sizes if several else sizes.popitem()[1]
+            columns.append(ImageColumns(camera, part.board is not None, session if set_ups else None))
         elif part.kind == "socket":
             distances = {
                 (part.names[a], part.names[b]): length for a, b, length in part.lengths

@@ -31,12 +31,10 @@ from diffeo_calib.measurements.csv.cells import csv_text, find_columns, number
 from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
-MOVED = 1e-3
-"""Part of the range of a column by which it moves at least, unless its noise is larger."""
+MOVED = 1e-3  # part of the range of a column by which it moves at least, unless its noise is larger
 CLOCKS_AGREE = 0.1
 """Spread of the differences of two clocks at most, relative to the pauses between rows, and to how these differ."""
-Pairs = list[tuple[int, int]]
-"""Numbers of lines with the same joint values: of the joints and of the places."""
+Pairs = list[tuple[int, int]]  # numbers of lines with the same joint values: of the joints and of the places
 
 
 class HeldFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
@@ -193,16 +191,11 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
 # --- stops
 
 Array = np.ndarray
-PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-"""Columns of a place and a rotation."""
-NOISE_FACTOR = 8.0
-"""Range of the noise within a window, in standard deviations, that is no motion."""
-STEP_S = 0.01
-"""Of the grid on which both recordings are compared."""
-SAME_TURN = 1e-9
-"""Range of a quaternion's numbers at all stops that is rounding."""
-FEWEST_CHANGES = 4
-"""Beginnings and ends of motions that tell how far the clocks differ."""
+PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")  # columns of a place and a rotation
+NOISE_FACTOR = 8.0  # range of the noise within a window, in standard deviations, that is no motion
+STEP_S = 0.01  # of the grid on which both recordings are compared
+SAME_TURN = 1e-9  # range of a quaternion's numbers at all stops that is rounding
+FEWEST_CHANGES = 4  # beginnings and ends of motions that tell how far the clocks differ
 
 
 @dataclass(frozen=True)

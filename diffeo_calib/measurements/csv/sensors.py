@@ -61,10 +61,8 @@ class SensorColumns:
     """
 
     word: ClassVar[str]
-    hidden: ClassVar[bool] = False
-    """Whether rows may show some of it alone, and leave the other cells empty."""
-    texts: Mapping[str, bool]
-    """Columns of texts, and whether a table must have them."""
+    hidden: ClassVar[bool] = False  # whether rows may show some of it alone, and leave the other cells empty
+    texts: Mapping[str, bool]  # columns of texts, and whether a table must have them
     filled: Any
     table: Any
     written: Any
@@ -369,14 +367,6 @@ class ImageColumns(SensorColumns):
     camera_on_tool: bool = False
     device: str | None = None
     word = "an image"
-
-    @classmethod
-    def of(cls, data: Any, session: str | None) -> ImageColumns:
-        """How to read images that are written, with this column of set-ups."""
-        several = len(data.cameras) > 1
-        session = None if not data.session_names or (several and data.device_names == data.camera_names) else session
-        sizes = {name: (camera.width, camera.height) for name, camera in data.cameras.items()}
-        return cls(sizes if several else sizes.popitem()[1], data.board is not None, session)
 
     @property
     def texts(self) -> Mapping[str, bool]:

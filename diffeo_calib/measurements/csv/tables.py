@@ -73,8 +73,7 @@ class TableOrigin:
         return dict(zip(file.header, map(list, zip(*wanted, strict=True)), strict=True))
 
 
-FEW_ROWS = 2000
-"""Rows among which those of a marker that was not seen are looked for."""
+FEW_ROWS = 2000  # rows among which those of a marker that was not seen are looked for
 MUCH_FARTHER = 3.0
 """Times the largest distance of a row from its nearest one: so far is a single 0, 0, 0 where it is no position."""
 
