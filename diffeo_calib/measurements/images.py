@@ -157,13 +157,6 @@ class ImageTable(RowGroups):
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{camera}/") else f"{camera}/{name}" for camera, name in pairs]
 
-    def sees_board_from_tool(self, *, commanded: bool = False) -> bool | None:
-        """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board.
-
-        Beside ``commanded`` poses, measured ones are of a frame on the tool that a camera sees.
-        """
-        return True if self.board is not None else False if self.cameras or (commanded and self.lever) else None
-
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Errors that images share; none of other rows."""
         shared, covariance, lever = self.pose_shared, self.pose_covariance, self.lever

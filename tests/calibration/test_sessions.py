@@ -116,7 +116,7 @@ def other_names(text: str) -> str:
 def test_rows_of_other_sessions_in_one_frame_are_named(table: dc.Measurements, result: Any, command: Command) -> None:
     dc.save(result.model, "m.safetensors")
     done = command("evaluate", "m.safetensors", "t.csv", *TABLE)
-    assert "70 rows of the fit were measured in another set-up than that of the model" in " ".join(done.err.split())
+    assert "70 rows of the fit, of another set-up than the model's" in " ".join(done.err.split())
     assert "name the column of the set-ups (--session)" in " ".join(done.err.split())
     lines = Path("t.csv").read_text().split("\n")
     own = [line for line in lines[1:] if line.endswith(result.sessions.names[result.sessions.reference])]

@@ -95,10 +95,10 @@ def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Comman
     done = command("init", files.joints, files.urdf, "-o", tmp_path / "c.toml")
     assert "if they are in another file: --places FILE --by name;" in done.error
     done = command("init", files.joints, files.urdf, "--places", files.whole, "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have" not in done.error
+    assert "--places without --by: expected a column of both files" not in done.error
     (tmp_path / "p.csv").write_text("x,y,z\n1,2,3\n")
     done = command("init", files.joints, files.urdf, "--places", tmp_path / "p.csv", "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have, got name, " in done.error
+    assert "--places without --by: expected a column of both files, got name, " in done.error
 
 
 @pytest.mark.parametrize(

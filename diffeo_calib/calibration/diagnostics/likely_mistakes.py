@@ -172,6 +172,7 @@ def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     for factor, times, size in _units_of_length():
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
         words = f"the positions seem to be {times:.4g} times too {size}: check their unit (`length`)"
+        words += ", and that of the commanded ones (`joint_length`)" * is_cartesian(robot)
         yield replace(as_read, points=points, words=words)
     words = "the points seem to be one row too {}: pair every configuration with its own"
     yield replace(as_read, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
