@@ -168,7 +168,7 @@ def test_marker_that_no_row_shows_is_refused() -> None:
     q, points = arm.measure(20, seed=4)
     points[10:, 1] = nan
     data = dc.Measurements(q, points, arm.nominal.joint_names)
-    with pytest.raises(MeasurementError, match="marker 1 is hidden in all 10 rows"):
+    with pytest.raises(MeasurementError, match="marker 1: hidden in all 10 rows"):
         dc.calibrate(arm.nominal, data.rows(slice(10, None)))
     with pytest.raises(MeasurementError, match="never show marker 1"):
         register(arm.nominal, q[10:], points[10:])

@@ -70,12 +70,12 @@ REFUSED = {
     r"no moving joint from 'output_link' to 'flange'": given("--base", "output_link"),
     r"do not fit this robot, even with geometric errors.* as the tip": given("--tip", "wrist_link"),
     r"expected 6 columns, in the order .*, got 2": given("--joints", "waist_joint,shoulder_joint"),
-    r"in another order than the robot's: expected waist_joint,.*leave it out: columns that are named after": given(
+    r"in another order: expected waist_joint,.*leave it out: columns that are named after": given(
         "--joints", "shoulder_joint,waist_joint,elbow_joint,forearm_roll_joint,wrist_bend_joint,wrist_roll_joint"
     ),
     r"there is no file nowhere.urdf; check the path of --robot": given("--robot", "nowhere.urdf"),
     r"--rotation is given, but its --convention is not: expected 'rotvec'": given("--rotation", "a,b,c", edit=turned),
-    r"--rotation-angle is missing: the unit of the rotation: expected 'rad'": given(*ROTATION[:4], edit=turned),
+    r"--rotation-angle is missing: expected 'rad'": given(*ROTATION[:4], edit=turned),
     r"--lever without --rotation": given("--lever", "100"),
     r"--std: expected names of columns: one, one per marker or three per": given("--std", "a,b"),
     r"`lever`.*above 0, got -0.005": given("--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5", edit=turned),
