@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import seeded
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
@@ -117,7 +117,7 @@ class KindRows(NamedTuple):
     q: Tensor  # (N, n)
     y: Tensor  # (N, B, d) numbers of B bodies, m, NaN where hidden
     around: Devices | None = None  # of readings: those around which their places are sought
-    device: Tensor = torch.empty(0)  # (N,) numbers of these
+    device: Tensor = torch.zeros(0, dtype=torch.int64, device=HOST)  # (N,) numbers of these
 
     @classmethod
     def positions(cls, q: Tensor, points: Tensor) -> KindRows:
