@@ -1,7 +1,5 @@
 """Unusual data: other numbers of joints, repeats, known deviations, and markers that some rows hide."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from math import nan
@@ -124,9 +122,6 @@ def test_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert float(errors.square().mean()) < 0.05 * float(geometry.square().mean())
     squares = (errors[:, None] @ torch.linalg.solve(covariance, errors[:, :, None])).flatten()
     assert float((squares < 7.8147).double().mean()) > 0.9
-
-
-# --- hidden markers ---------------------------------------------------------------------------------------------------
 
 
 def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
