@@ -445,12 +445,10 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: Tensor) -
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
     size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
-    what = (
-        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}"
-    )
+    count, where = int(flags[start:end].sum()), f"lines {lines[0]} to {lines[-1]}{last}"
     got = f"a median error of {1e3 * size:.3g} mm; {', '.join(motions(model, block)) or 'for no common reason'}"
     fix = "check what happened there; calibrate without these lines, or measure them again"
-    return sentence(what, got=got, fix=fix)
+    return sentence(f"{count} rows look wrong that follow one another: {where}", got=got, fix=fix)
 
 
 def common_cause(
