@@ -242,6 +242,7 @@ def warn_of_outliers(outlying: Sequence[Outlier], data: Any) -> None:
     parts += [(words, rows) for words, rows, _ in _device_rows(data)]
     many = [(words, rows) for words, rows in parts if float(flags[rows].double().mean()) > gates.GROSS_SHARE]
     if many:
+        many = many[:1] if many[0][0] == "rows" else many
         counts = few([f"{int(flags[rows].sum())} of {len(rows)} {words}" for words, rows in many], MOST_NAMES)
         fix = "do not rely on these rows: check that they pair joints with their own points, that markers keep their "
         fix += "numbers, the columns and units; of a set-up, whether more has moved than was said: leave it out, and "
