@@ -3,8 +3,6 @@
 And a package that only shrinks: its lines and those of each of its folders are held at the numbers of sizes.json.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import json
@@ -93,14 +91,6 @@ def test_small_pieces() -> None:
     assert not found, "\n".join(found)
 
 
-def test_big_pieces_are_found() -> None:
-    names = ", ".join("abcdefghi")
-    long = f"def f({names}):\n" + MOST_CODE_LINES * "    a = b\n" + MOST_LINES * "\n"
-    found = [text.partition(": ")[2] for text in too_big(Path("f.py"), long)]
-    assert found == ["561 lines: split the file by subject", "61 lines of code: split f", "group the parameters of f"]
-    assert not list(too_big(Path("f.py"), f"class Problem:\n    def __init__(self, {names}):\n        pass\n"))
-
-
 VAGUE, MOST_USES = ("found", "known", "one", "own", "seen", "told"), 150
 """Words that say nothing of what a name holds, and how often the package may use each as one."""
 
@@ -112,9 +102,6 @@ def test_names_say_what_they_hold() -> None:
     nodes = [node for tree in trees for node in ast.walk(tree) if type(node) in kinds]
     uses = Counter(getattr(node, kinds[type(node)]) for node in nodes)
     assert {word: uses[word] for word in VAGUE if uses[word] > MOST_USES} == {}
-
-
-# --- lines only fall ----------------------------------------------------------------------------------------------
 
 
 def lines_of_package() -> dict[str, int]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.poses import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import RowGroups, with_attributes
@@ -23,13 +23,11 @@ if TYPE_CHECKING:
 CAMERA_WARNED, CAMERA_REFUSED = 1.05, 5.0
 """Factors between the errors of corners with the given camera and with a free one, from which the images seem to show
 another camera. A focal length that is wrong by 1 % makes 1.06 of 60 images with errors of 0.2 px."""
-FEWEST_IMAGES = 8
-"""From which a free lens is well enough known to be compared."""
+FEWEST_IMAGES = 8  # from which a free lens is well enough known to be compared
 
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
-ONLY_CAMERA = "camera"
-"""Name of a camera that is alone."""
+ONLY_CAMERA = "camera"  # name of a camera that is alone
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
@@ -110,9 +108,7 @@ class ImageTable(RowGroups):
         priors = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
-            fix = (
-                "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
-            )
+            fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that are not shown"
             raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
         checks.check_rows(angles, given, "corners")
         given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
@@ -155,19 +151,11 @@ class ImageTable(RowGroups):
             return names
         if self.board is not None:
             if not remounted or list(names) != self.camera_names:
-                what, fix = "several cameras on the tool", "calibrate with the images of each set-up by themselves"
-                got = few(list(dict.fromkeys(names)))
-                raise MeasurementError.of(what, expected="one board that stayed, so no set-ups", got=got, fix=fix)
+                fix = "calibrate with the images of each set-up by themselves"
+                raise MeasurementError.of("several cameras on the tool", expected="no set-ups", fix=fix)
             return names
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{camera}/") else f"{camera}/{name}" for camera, name in pairs]
-
-    def sees_board_from_tool(self, *, commanded: bool = False) -> bool | None:
-        """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board.
-
-        Beside ``commanded`` poses, measured ones are of a frame on the tool that a camera sees.
-        """
-        return True if self.board is not None else False if self.cameras or (commanded and self.lever) else None
 
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Errors that images share; none of other rows."""
@@ -215,6 +203,20 @@ class ImageTable(RowGroups):
         table = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
         columns = {name: getattr(table, name) for name in ("q", "poses", "points", "board")}
         return with_attributes(self, **columns, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
+
+    def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
+        """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ."""
+        pairs = [(camera, cameras.get(name)) for name, camera in self.cameras.items()]
+        if self.corners is None or not pairs or not all(old is not None and camera.alike(old) for camera, old in pairs):
+            return self
+        known = {name: cameras[name] for name in self.cameras}
+        names, on_tool = self.camera_names, self.board is not None
+        again = self.from_images(
+            self.q, self.corners, known, self.joint_names, seen_by=names, camera_on_tool=on_tool, doubt=False
+        )
+        columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
+        columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
+        return with_attributes(self, **columns)
 
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.
@@ -269,9 +271,9 @@ def _sights(corners: Sequence[Tensor], priors: Mapping[str, Known], board: Board
             raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
         low, high = (torch.stack(list(shown.pixels[shown.seen].aminmax(dim=0)))).tolist()
         if min(low) < -1.0 or high[0] > shown.width or high[1] > shown.height:
-            got = f"from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
             expected = f"pixels within images of {shown.width} x {shown.height}"
-            fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
+            got = f"({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
+            fix = "pass the size of these images, or a camera calibrated at that size"
             raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
         images.append(shown)
     cameras = [prior if isinstance(prior, Camera) else None for prior in priors.values()]

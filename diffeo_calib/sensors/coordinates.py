@@ -17,16 +17,15 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET
-from diffeo_calib.measurements.sockets import KIND, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
-from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.tables import Coordinates, with_positions
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -82,6 +81,12 @@ def known_devices(model: object) -> dict[str, Any]:
 def mounted_of(model: Any) -> SetUps:
     """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
     return mounted_kind(model.lever).among(known_devices(model), model.turns)
+
+
+def with_earlier_cameras(data: Any, model: Any) -> Any:
+    """New rows with what a calibrated model knows of the cameras that saw their boards."""
+    cameras = {name: one.camera for devices in model.placement for name, one in devices.cameras.items()}
+    return with_positions(data, lambda part: part.with_earlier(cameras)) if cameras else data
 
 
 LARGEST_SHARE = 0.5
@@ -320,7 +325,7 @@ class Contacts(OtherDevices):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data.sockets)[0].norm(dim=1)
+            away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data)[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         spread = share(data.q)
@@ -341,11 +346,11 @@ class Contacts(OtherDevices):
 
     def errors(self, data: SocketReadings, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        away, distances = socket_errors(points[:, -1], data.device.to(points.device), data.sockets)
+        away, distances = socket_errors(points[:, -1], data.device.to(points.device), data)
         return replace(self._spread(data, away), distances=distances)
 
     def away(self, data: SocketReadings, points: Tensor, places: Places) -> Tensor:
-        return socket_errors(points[:, -1], data.device.to(points.device), data.sockets)[0]
+        return socket_errors(points[:, -1], data.device.to(points.device), data)[0]
 
     def in_unit(self, data: SocketReadings, devices: Devices, errors: Tensor) -> Evaluation:
         return self._spread(data, errors.masked_fill(alone(data.device).to(errors.device)[:, None], torch.nan))

@@ -1,7 +1,5 @@
 """Rows that cannot belong to the robot: refused if a mistake explains them, else calibrated with a warning."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -26,9 +24,6 @@ from diffeo_calib.robots import Joint, SimulatedArm
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
 ARM, ROWS, _ = simulated(30)
 ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
-
-
-# --- refused ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -73,9 +68,6 @@ def test_rows_that_cannot_be_those_of_the_robot_are_refused() -> None:
         (r"at least 3 poses, got .*measure more poses", calibrated(Q[:2], POINTS[:2])),
         (r"same configuration|does not move", calibrated(Q[:1].repeat(30, 1), POINTS[:1] + 1e-5 * normal(30, 1, 3))),
     )
-
-
-# --- doubtful rows ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:rail. never moved")
@@ -167,17 +159,6 @@ def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
     points[:20] = points[:20, [1, 0]]
     _, texts = warned(with_usual_scales, pair.robot, dc.Measurements(pair.train.q, points))
     assert any(re.search(r"rows are outliers.*markers (0 and 1|1 and 0) seem to be exchanged", one) for one in texts)
-
-
-@pytest.mark.slow
-def test_warnings_point_at_the_caller(arm: Case) -> None:
-    """However deep in the package they are found."""
-    overstated = dc.Measurements(arm.train.q[:30], arm.train.points[:30], std=2e-2)  # mm given as m
-    for data, word in ((arm.train.rows(slice(8)), "too few"), (overstated, "selected scales.*check `std`")):
-        with pytest.warns(DiffeoCalibWarning) as caught:
-            dc.calibrate(arm.robot, data)
-        assert any(re.search(word, str(one.message)) for one in caught)
-        assert [(str(one.message), one.filename) for one in caught if one.filename != __file__] == []
 
 
 def test_poses_commanded_in_whole_degrees_are_calibrated() -> None:

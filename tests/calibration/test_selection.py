@@ -1,12 +1,9 @@
 """Scales: defaults, the log posterior against scipy and formulas, the search; the rows that they are chosen for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +12,7 @@ from kind_bank import kind_named
 from process_bank import case
 from product_bank import Case, noise_blocks
 from scipy.stats import chi2
-from tangent_bank import (
-    Setting,
-    built,
-    noise_covariance,
-    normal,
-    shaken,
-    tangent_covariance,
-    weighted,
-)
+from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -33,11 +22,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.noise_model import differing_factor
-from diffeo_calib.calibration.scales.selection import (
-    defaults,
-    log_posterior,
-    select,
-)
+from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -46,9 +31,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
-
-# --- defaults ---------------------------------------------------------------------------------------------------------
+from diffeo_calib.robots import SimulatedArm
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
@@ -74,34 +57,6 @@ def test_the_unit_of_length_does_not_matter() -> None:
     assert_close(grown.rotation_noise, setting.scales.rotation_noise, rtol=1e-6, atol=0)
     assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude, rtol=1e-6, atol=0)
     assert bool((grown.joint_noise > 0).all())
-
-
-def test_joints_without_motion_or_lever_have_finite_scales() -> None:
-    """Also of a robot whose axes all meet at its tip, with and without sag."""
-    setting = built("sliding")
-    data, x, prior = setting.tangent_data, setting.data.q.clone(), setting.identification.prior
-    x[:, 2] = 0.3
-    levers = data.nominal.jacobian(x, data.theta)
-    levers[..., 5] = 0.0  # no lever at all
-
-    class Blind(GeometryMap):
-        def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-            return levers
-
-    blind = replace(data, nominal=Blind(setting.nominal.geometry, elastic=True), x=x)
-    scales = [defaults(replace(data, x=x), 1e-4, prior), defaults(blind, 1e-4, prior)]
-    amplitude = scales[1].transmission_amplitude
-    assert float(amplitude[5]) <= 3.01 * float(amplitude.min())
-    origin, axis = torch.eye(4, dtype=torch.float64), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    arm = Chain("ball", "floor", "hand", [Joint("a", "revolute", origin), Joint("b", "revolute", origin, axis)])
-    for elastic in (False, True):
-        nominal = GeometryMap(Geometry.nominal(arm).with_tool(axis[None]), elastic=elastic)
-        theta = torch.zeros(nominal.parameters, dtype=torch.float64)
-        scales.append(defaults(replace(data, nominal=nominal, theta=theta, x=normal(10, 2, seed=1)), 1e-4, prior))
-    assert all(bool(torch.isfinite(one.logarithms()).all()) for one in scales)
-
-
-# --- log posterior ----------------------------------------------------------------------------------------------------
 
 
 def log_prior(scales: dc.Hyperparameters, centre: dc.Hyperparameters) -> float:
@@ -186,54 +141,6 @@ def test_gradient_against_central_differences(rows: Callable[[], tuple[dc.Hyperp
         assert float(found.gradient @ step) == pytest.approx(expected, rel=1e-4, abs=1e-6 * scale)
 
 
-def value(setting: Setting, scales: dc.Hyperparameters) -> float:
-    """Log posterior, up to a constant."""
-    found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)
-    return found.likelihood + found.prior
-
-
-def test_a_search_that_ends_early_keeps_the_best_so_far() -> None:
-    """First its start; the line search overshoots at times, and the scales that are kept never get worse."""
-    setting = built("two markers")
-    start, kept = shaken(setting.scales, 4), []
-    for calls in range(2, 10):
-        left = iter(range(calls - 1))
-
-        def progress(*_: object, left: Any = left) -> None:
-            if next(left, None) is None:
-                raise KeyboardInterrupt
-
-        found = select(setting.scales, setting.tangent_data, start=start, progress=progress)
-        assert found.interrupted
-        kept.append(value(setting, found.scales))
-    assert kept[0] == pytest.approx(value(setting, start), rel=1e-9)
-    assert kept == sorted(kept)
-    assert kept[-1] > kept[0] + 1.0
-    whole = select(setting.scales, setting.tangent_data, start=start)
-    assert value(setting, whole.scales) > kept[-1]
-    likelihood = log_posterior(whole.scales.logarithms(), setting.scales, setting.tangent_data).likelihood
-    assert f"likelihood {likelihood:.1f} on {len(setting.data)} poses" in whole.status
-
-
-@pytest.mark.parametrize("every", [1, 3])
-def test_a_failed_factorisation_is_a_rejected_step(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, calls = torch.linalg.cholesky_ex, [0]
-
-    def fails(matrix: Tensor, **options: Any) -> Any:
-        factor, info = real(matrix, **options)
-        calls[0] += matrix.ndim == 2  # not blocks of the noise
-        failed = matrix.ndim == 2 and calls[0] % every == 0
-        return (torch.full_like(factor, math.nan), torch.ones_like(info)) if failed else (factor, info)
-
-    setting = built("two markers")
-    with monkeypatch.context() as patch:
-        patch.setattr(torch.linalg, "cholesky_ex", fails)
-        found = select(setting.scales, setting.tangent_data)
-    assert calls[0] >= every
-    assert bool(torch.isfinite(found.scales.logarithms()).all())
-    assert value(setting, found.scales) >= value(setting, setting.scales)
-
-
 @pytest.mark.slow
 def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     """Joints that do not repeat, a perfect tracker: s must be found, and nothing may be learnt from it."""
@@ -249,23 +156,6 @@ def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     seen = noise_blocks(scales, nominal, test.q).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
     assert float(seen) > 0.5 * float((test.points - arm.true_points(test.q)).norm(dim=-1).square().mean().sqrt())
     assert float(scales.joint_noise.max()) > 3e-5
-
-
-# --- rows around a geometric calibration ------------------------------------------------------------------------------
-
-
-def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
-    """Whatever was asked for before: other scales, other weights, other measurements, fewer rows."""
-    first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
-    kept, other = setting.tangent_data.with_tails(setting.tangent_data.tails), weighted(setting, 3)
-    kept.process(first)
-    some = kept.rows(torch.arange(3))
-    orders = [(kept.with_tails(other.tails), first), (kept, second), (kept, first), (some, first)]
-    for data, scales in [*orders, (replace(kept, y=kept.y + 1e-3), first)]:
-        assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
-
-
-# --- six numbers of a pose in place of nine coordinates ---------------------------------------------------------------
 
 
 def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
@@ -284,8 +174,6 @@ def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
     assert maps[0].slopes is None
     assert maps[0].noise.covariance.shape == (12, 9, 9)
 
-
-# --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
 

@@ -1,7 +1,5 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import io
@@ -24,7 +22,6 @@ from table_bank import refused
 import diffeo_calib as dc
 from diffeo_calib.campaign.feeds import LONGEST_LINE, Inbox, as_line, check_cells, parsed, read_lines
 from diffeo_calib.campaign.journal import GrowingTable, Journal
-from diffeo_calib.cli.commands.campaign import Live
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -112,23 +109,6 @@ def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(InputError, match="not the journal"):
             Journal(path)
-
-
-def test_a_file_system_without_locks_or_fsync(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command, lines: list[str]
-) -> None:
-    """The campaign runs, and says that nothing keeps a second one away."""
-
-    def refused(*_: object) -> None:
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-    monkeypatch.setattr("fcntl.flock", refused)
-    monkeypatch.setattr(os, "fsync", refused)
-    (tmp_path / "run.csv").write_text("".join(lines[:3]))
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--accepted", tmp_path / "accepted.csv")
-    assert done.code == 0, done.err
-    assert "run no second campaign" in done.warnings[0]
-    assert (tmp_path / "accepted.csv").read_text() == "".join(lines[:3])
 
 
 def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,40 +212,6 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
 
 
-def test_rows_that_are_there_before_are_judged_as_with_once(
-    tmp_path: Path, lines: list[str], command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also without a row that comes later; a line that cannot be read is named by its place in the table.
-
-    No line can be read where a column is missing: the campaign ends, and the journal says nothing.
-    """
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
-    wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
-    (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--position", "x,y,w")
-    assert done.code == 1
-    assert "run.csv', header: no column ['w']" in done.error
-    assert (tmp_path / "run.csv.journal").read_bytes() == b""
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--length", "m")
-    assert any(f"file '{tmp_path / 'run.csv'}': " in text for text in done.warnings)  # 1000 m
-    (tmp_path / "run.csv.journal").unlink()
-    accepted = []
-    goal = '"error_limit_mm": null, "more_rows": '
-    for how, known in (  # the last one answers in JSON
-        (["--once"], "mm expected"),
-        (["--stdin", "--tolerance", "1um"], goal),
-        (["--stdin"], '"expected_error_mm": 0.'),
-    ):
-        done = command("campaign", tmp_path / "campaign.toml", *how, "--accepted", tmp_path / "accepted.csv")
-        assert done.code == (4 if known == goal else 0)
-        for words in ("row 15 looks wrong", known, "run.csv', line 17"):
-            assert words in done.out
-        assert (goal in done.out) == (known == goal)
-        accepted.append((tmp_path / "accepted.csv").read_text())
-        (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1] == accepted[2] == "".join([*lines[:14], lines[14]])
-
-
 @pytest.mark.slow
 def test_it_ends_while_a_program_may_still_send_rows(tmp_path: Path, lines: list[str]) -> None:
     (tmp_path / "run.csv").write_text("".join(lines[:4]))
@@ -349,31 +295,6 @@ def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Ca
         return done, [json.loads(line) for line in done.out.splitlines()]
 
     return sent
-
-
-def test_lines_that_wait_at_the_target_are_judged_before_a_row_that_is_sent(
-    tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else the numbers of lines and of verdicts part, and the campaign cannot go on."""
-    monkeypatch.setattr("diffeo_calib.cli.commands.campaign.TOGETHER", 1)
-    monkeypatch.setattr(dc.Campaign, "reached", property(lambda own: 20 <= len(own) < 26))
-    path, take = tmp_path / "run.csv", Live.take
-
-    def late(live: Live, entry: Any) -> None:
-        """Another program writes just before the last row is taken."""
-        if entry["id"] == 24 and len(live.lines) == 18:
-            sent = [json.loads(row(number)) for number in range(18, 24)]
-            with path.open("a") as file:
-                names = path.read_text().splitlines()[0].split(",")
-                file.writelines(",".join(str(one[name]) for name in names) + "\n" for one in sent)
-        take(live, entry)
-
-    monkeypatch.setattr(Live, "take", late)
-    done, answers = run(map(row, [*range(18), 24]))
-    assert done.code == 0
-    assert [one["line"] for one in answers if "line" in one] == [*range(2, 27)]
-    done, answers = run([row(24)])
-    assert (done.code, answers[-2]["rows"]) == (0, 25)
 
 
 def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:

@@ -1,7 +1,5 @@
 """A campaign judges rows as they come: algebra against a fresh factorisation, named mistakes, the result."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 
@@ -80,26 +78,6 @@ def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[
     assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
     assert [one.row for one in campaign.verdicts if not one.accepted] == [15, 17]
     assert [one.row for one in campaign.verdicts if one.again] == [17]
-
-
-def test_rows_that_give_no_model_are_tried_once(
-    measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (q, y), tries = measured, []
-    still = dc.Campaign(ARM.nominal).add(q[:1].repeat(12, 1), y[:1].repeat(12, 1, 1))
-    assert "all 12 rows hold the same configuration" in still[-1].cause
-
-    def refused(_: Any, table: Any, *__: Any, **___: Any) -> None:
-        tries.append(len(table))
-        raise dc.DiffeoCalibError("these rows do not say where the device is")
-
-    monkeypatch.setattr("diffeo_calib.campaign.campaign.Around.of", refused)
-    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
-    campaign.add(q[:12], y[:12])
-    campaign.reject(0)
-    for row in (12, 13):
-        campaign.add(q[row], y[row])
-    assert tries == [12, 13]
 
 
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
@@ -280,39 +258,3 @@ def test_the_limit_holds_95_percent_of_errors() -> None:
     limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
     assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
     assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
-
-
-def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
-    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
-    campaign: Any = copy.deepcopy(running)
-    known, limit = campaign.expected_error, campaign.error_limit
-    assert 1.1 < limit / known < 2
-    for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
-        campaign.goal = goal
-        assert campaign.reached == (needed == 0)
-        assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
-        assert needed is None or campaign.next(1).needed == needed
-    campaign._make(campaign.table, campaign.verdicts)  # around all rows, with the same scales
-    campaign.poll()
-    assert (campaign._model.count, campaign._next_scales(campaign._model)) == (ROWS, pytest.approx(2.0 * 20))
-    assert 1.1 < campaign.error_limit / campaign.expected_error < 2
-    few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
-    assert few.expected_error is not None
-    assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-def test_next_poses_of_a_ball_are_in_sockets() -> None:
-    kind = kind_named("ball in sockets")
-    rows, q = kind.source.rows, kind.q(30)
-    ball, own = kind.model(rows.q).detach()[:, -1], rows.device
-    sockets = torch.stack([ball[own == number].mean(0) for number in own.unique()])
-    drawn, given = begun(rows, kind.robot, target=q), begun(rows, kind.robot, candidates=q, target=q)
-    found: Any = drawn.next(5)
-    assert len(found.q) == 5
-    away = torch.cdist(kind.model(found.q).detach()[:, -1], sockets).amin(1)
-    assert float(away.max()) < 0.03
-    assert found.expected[5] < found.expected[0]
-    none: Any = given.next(5)
-    assert len(none.q) == 0

@@ -3,25 +3,19 @@
 What a terminal shows of names and cells, short and without control characters; the progress line.
 """
 
-from __future__ import annotations
-
 import importlib
-import io
 import re
-import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from command_bank import Command, Site, edited, environment, run_process, set_cell
-from rich.console import Console
+from command_bank import Command, Site, edited, run_process, set_cell
 
 import diffeo_calib as dc
 from diffeo_calib.cli import console
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.declarations import COMMANDS
-from diffeo_calib.common.errors import LONGEST_NAME, InputError, few, listed, printable, sentence, shown
+from diffeo_calib.common.errors import few, listed, printable, sentence
 
 OPTIONS = {
     name: ["--json", *(word for one in options.all() for word in one.names or (one.shown,))]
@@ -80,27 +74,6 @@ def test_former_names_say_what_to_do(former: str, advice: str, command: Command)
     assert advice in command(*former.split()).err
 
 
-def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, command: Command) -> None:
-    (tmp_path / "c.toml").write_text('csv = "t.csv"\npayload_mass = 3\n')
-    assert "--payload-mass is gone; write --payload." in command("fit", tmp_path / "c.toml").err
-
-
-def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:
-    """In words of the command line, though those of tables are of the class in Python."""
-    page = command("fit", "--help").out
-    found, text = entries(page), " ".join(page.split())
-    assert "required" not in found["--robot"] + found["--joints"]  # or --robot-pose
-    assert "[required]" in found["CSV"]
-    assert "default: 0.3" in found["--holdout"]
-    assert "0.0<=x<=0.9" in found["--holdout"]
-    assert "<m|mm|cm|inch>" in page
-    assert "Python" not in text.partition("Options:")[2]
-    assert text.count("needed where no model knows it") == 2
-    assert "all are in the plane of x and y. Repeatable." in text
-    assert "in the unit of --length." in text
-    assert "diffeo_calib.reports.results" in text
-
-
 SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors", "llvmlite")
 LIGHT = f"""
 import atexit, sys
@@ -112,9 +85,7 @@ main()
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [["--help"], ["-h"], ["--version"], ["fit", "--help"], ["demo", "-h"]],
-    ids=" ".join,
+    "arguments", [["--help"], ["-h"], ["--version"], ["fit", "--help"], ["demo", "-h"]], ids=" ".join
 )
 def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
     done = run_process(*arguments, program=("-c", LIGHT))
@@ -140,19 +111,6 @@ def test_completion_loads_nothing_slow(words: str, expected: list[str]) -> None:
     assert done.out.split() == expected
 
 
-def test_the_script_of_the_completion_asks_the_program(tmp_path: Path) -> None:
-    variables = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = run_process("--show-completion", "bash", variables=variables)
-    assert done.code == 0
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in done.out
-    assert re.search(r"^complete .*-F \w+ diffeo-calib$", done.out, re.MULTILINE)
-    done = run_process("--install-completion", "bash", variables={**variables, "HOME": str(tmp_path)})
-    assert done.code == 0
-    (script,) = (tmp_path / ".bash_completions").iterdir()
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in script.read_text()
-    assert str(script) in (tmp_path / ".bashrc").read_text()
-
-
 def test_the_module_is_the_program() -> None:
     done = run_process("-h", program=("-m", "diffeo_calib"))
     assert done.code == 0
@@ -167,24 +125,6 @@ def test_the_console_script_points_into_the_package() -> None:
     assert found is not None
     assert callable(getattr(importlib.import_module(found[1]), found[2]))
     assert version("diffeo_calib") == dc.__version__
-
-
-@pytest.mark.parametrize(
-    ("output", "message"), [("none/model", "make its folder first"), ("model", "no file t.csv; check")]
-)
-def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_path: Path) -> None:
-    fit = ["fit", "t.csv", "--robot", "r.urdf", "--base", "a", "--tip", "b", "--position", "x,y,z"]
-    units = ["--length", "m", "--angle", "rad", "-o", str(tmp_path / output)]
-    command = [sys.executable, "-c", LIGHT, *fit, *units]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=60, check=False, encoding="utf-8")
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert "torch" not in done.stderr.splitlines()[-1]
-
-
-def test_evaluate_loads_nothing_that_draws() -> None:
-    program = "import sys, diffeo_calib.cli.commands.evaluate; print('matplotlib' in sys.modules)"
-    assert run_process(program=("-c", program)).out == "False\n"
 
 
 ESCAPE = "\x1b[31mred\x07"
@@ -204,14 +144,6 @@ def test_control_characters_are_escaped_everywhere() -> None:
     assert plain("two\nlines") == "two\nlines"
 
 
-def test_long_values_are_cut_in_the_middle() -> None:
-    assert len(shown("x" * 100_000)) <= LONGEST_NAME
-    assert shown("short") == "short"
-    assert shown("begin" + "x" * 1000 + "end").startswith("begin")
-    assert shown("begin" + "x" * 1000 + "end").endswith("end")
-    assert len(str(InputError.of("w" * 10**5, expected="e" * 10**5, got="g" * 10**5, fix="f" * 10**5))) < 6000
-
-
 @pytest.mark.parametrize("text", [ESCAPE, "x" * 100_000])
 def test_names_and_cells_of_a_file_do_not_reach_the_terminal_as_they_are(
     text: str, small_site: Site, command: Command, tmp_path: Path
@@ -227,28 +159,6 @@ def test_names_and_cells_of_a_file_do_not_reach_the_terminal_as_they_are(
         assert "\x1b" not in done.err + done.out
         assert len(done.error) < 1500
         assert "elbow_joint" in done.error or words not in given[:2]
-
-
-def last_line(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, int, int]) -> str:
-    """The line on a terminal ten seconds after some calls, a second each."""
-    shown, now = io.StringIO(), [0.0]
-    monkeypatch.setattr(console, "err", Console(file=shown, force_terminal=True, width=120, color_system=None))
-    with console.progress_bar(clock=lambda: now[0]) as progress:
-        for call in calls:
-            progress(*call)
-            now[0] += 1.0
-        now[0] += 10.0
-    return [line for line in shown.getvalue().replace("\r", "\n").split("\n") if "0:00:" in line][-1]
-
-
-def test_progress_says_what_is_done_and_how_long_it_will_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A task without steps, and one that starts again, have no end."""
-    line = last_line(monkeypatch, ("registration", 0, 1), ("rows", 0, 400), ("rows", 100, 400), ("rows", 200, 400))
-    assert [word in line for word in ("rows", "registration", "0:00:13", "0:00:02")] == [True, False, True, True]
-    line = last_line(monkeypatch, ("rows", 400, 400), ("registration", 0, 1))
-    assert "finding base and markers" in line
-    assert "-:--:--" in line
-    assert "-:--:--" in last_line(monkeypatch, ("rows", 400, 400), ("rows", 0, 400))
 
 
 def test_keywords_are_said_as_options_unless_as_those_of_Python(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,5 @@
 """`init`: which robot, link, columns, units and conventions it proposes, and what `fit` says of the same."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -9,7 +7,6 @@ import shlex
 from dataclasses import replace
 from math import degrees, pi
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -102,33 +99,12 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     right = [f"right_{name}" for name in NAMES], q
     assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
     places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "right")]
-    both = (
-        ([f"left_{name}" for name in NAMES], q.roll(1, 0)),
-        (places[0], points.roll(1, 0)),
-        (places[1], points),
-    )
+    both = (([f"left_{name}" for name in NAMES], q.roll(1, 0)), (places[0], points.roll(1, 0)), (places[1], points))
     assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
 
 
 GON = 200.0 / pi
 GIVEN = ["--length", "mm", "--angle", "deg", "--position", "x,y,z"]
-
-
-def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(
-    tmp_path: Path, command: Command, frame: Any
-) -> None:
-    frame.to_csv(tmp_path / "t.csv", index=False)
-    name_space = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    (tmp_path / "arm.xacro").write_text(f'<robot name="a" {name_space}><xacro:arm prefix="left"/></robot>')
-    (tmp_path / "images").mkdir()
-    for table, robot, message in (
-        ("t.csv", "arm.xacro", "expand the xacro file first (`xacro FILE > robot.urdf`)"),
-        ("images", "arm.urdf", "is a folder: expected a table; of images of a board run `diffeo-calib images"),
-    ):
-        asked = command("init", tmp_path / table, tmp_path / robot, "-o", tmp_path / "c.toml")
-        words = [tmp_path / table, "--robot", tmp_path / robot, *GIVEN, "-o", tmp_path / "m.safetensors"]
-        assert asked.error == command("fit", *words).error
-        assert message in asked.error
 
 
 DH = [(0.07, -pi / 2, 0.41, 0.0), (0.5, 0.0, 0.0, -pi / 2), (0.04, -pi / 2, 0.0, 0.0)]
@@ -159,25 +135,6 @@ def test_the_convention_that_explains_the_rows(
     assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons(text)["robot"]
     fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *GIVEN, "-o", tmp_path / "m")
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
-
-
-def test_a_last_row_without_a_joint_and_options_that_do_not_belong(
-    tmp_path: Path, command: Command, proposed: Proposed
-) -> None:
-    """The row of a flange has no column; the tip is before it."""
-    q, points = write_dh_arm(tmp_path, "standard", 1.0, "joint_{}")
-    with (tmp_path / "arm.csv").open("a") as file:
-        file.write("\n0,0.05,0,0\n# standard")
-    entries, _ = proposed(([f"joint_{k}" for k in range(1, 7)], q), (XYZ, points), robot="arm.csv")
-    assert (entries["tip"], "dh-convention" in entries) == ("joint_6", False)
-    words = ["fit", tmp_path / "t.csv", *GIVEN, "-o", tmp_path / "m"]
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    for robot, option, message in (
-        ("arm.csv", ["--base", "link"], "--base or --load of a DH table"),
-        ("arm.csv", ["--tip", "flange"], "expected one of joint_1, joint_2"),
-        ("arm.urdf", ["--dh-convention", "craig"], "--dh-convention of a URDF"),
-    ):
-        assert message in command(*words, "--robot", tmp_path / robot, *option).error
 
 
 # --- columns whose names leave something open ---
@@ -325,22 +282,6 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     assert found["joints"] == "up,one [rad],-{two [rad]}"
 
 
-@pytest.mark.parametrize(("length", "per_metre"), [("m", 1.0), ("mm", 1e3)])
-def test_the_size_of_a_gantry_follows_from_its_limits(
-    length: str, per_metre: float, tmp_path: Path, proposed: Proposed
-) -> None:
-    link = '<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>'
-    link += '<limit lower="0" upper="1" effort="1" velocity="1"/></joint><link name="{2}"/>'
-    axes = ("x1", "a", "b", "1 0 0"), ("y1", "b", "c", "0 1 0"), ("z1", "c", "d", "0 0 1")
-    text = f'<robot name="g"><link name="a"/>{"".join(link.format(*axis) for axis in axes)}</robot>'
-    (tmp_path / "arm.urdf").write_text(text)
-    found, text = proposed((["x1", "y1", "z1"], per_metre * UNIT), (XYZ, per_metre * (0.999 * UNIT + 0.3)))
-    assert found["length"] == length
-    assert "limits of the joints" in text
-    found, text = proposed((["x1", "y1", "z1"], per_metre * UNIT), (XYZ, noise(30, 3, size=per_metre)))
-    assert (found, "one clear reading" in text) == ({}, True)
-
-
 @pytest.mark.slow
 def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
     """Meanings that nothing tells apart are for the user."""
@@ -381,17 +322,6 @@ def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, com
     read = described(as_at_the_fit(shlex.join(words), Rows()))
     assert read == replace(table, position=positions, joints=NAMES)
     assert [words[words.index(name) + 1] for name in ("--base", "--tip")] == ["base_link", "flange"]
-
-
-def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, proposed: Proposed) -> None:
-    q, points = rows()
-    proposed((NAMES, q), (XYZ, points), (["x2", "y2", "z2"], points + 30.0))
-    lines = (tmp_path / "t.csv").read_text().splitlines()
-    lines[5] = ",".join([*lines[5].split(",")[:-2], "#VALUE!", "1"])
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    entries, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert entries["position"] == ["x,y,z"]
-    assert "line 6, column 'y2': expected a number, got '#VALUE!'" in text
 
 
 @pytest.mark.parametrize(

@@ -1,24 +1,18 @@
 """`init`: sockets, rotations, deviations, wires, payloads and cameras of a table."""
 
-from __future__ import annotations
-
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from command_bank import Command
-from init_bank import ARM, ROWS, XYZ, Proposed, reasons, write_socket_table, write_wire_table
+from init_bank import ARM, ROWS, XYZ, Proposed, write_socket_table, write_wire_table
 from kind_bank import kind_named
 from product_bank import simulated_poses
 
 import diffeo_calib as dc
-from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.cli.main import expanded
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 
@@ -140,22 +134,6 @@ def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
     assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
 
 
-@pytest.mark.slow
-def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
-    """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
-    kind = kind_named("images of a board")
-    table, _ = kind.table("new")
-    (tmp_path / "sub").mkdir()
-    shutil.copy(table, tmp_path / "corners.csv")
-    (tmp_path / "launch.yaml").write_text("camera: none\n")
-    (tmp_path / "wrist.yaml").write_text(camera_text(next(iter(kind.data.cameras.values()))))
-    done = command("init", tmp_path / "corners.csv", kind.urdf, "-o", tmp_path / "sub" / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "sub" / "c.toml").read_text()
-    assert 'reading = "corners=../wrist.yaml"' in text
-    assert "the file beside the table" in reasons(text)["reading"]
-
-
 def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command, init: Proposed) -> None:
     """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
     kind = kind_named("images")
@@ -165,18 +143,3 @@ def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command:
     refused = command("fit", tmp_path / "c.toml")
     assert refused.code == 1
     assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
-
-
-@pytest.mark.slow
-def test_a_kind_from_outside_alone(tmp_path: Path, init: Proposed) -> None:
-    """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
-    said = {}
-    for name in ("laser beams", "inclinations"):
-        kind = kind_named(name)
-        table = tmp_path / f"{name[:3]}.csv"
-        rows = kind.source.rows.parts[1].with_joint_names(kind.robot.joint_names)
-        write_measurements(table, rows, TableFormat("mm", "deg"))
-        said[name] = init(table, kind.urdf)
-    assert "line distance=line distance" in said["laser beams"][0]["reading"]
-    assert not said["inclinations"][0]
-    assert "measured poses" in said["inclinations"][1]

@@ -1,12 +1,8 @@
 """Balls in sockets, readings, payloads, and rows of several kinds on the command line, and what is refused."""
 
-from __future__ import annotations
-
 import json
-import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from command_bank import Command
@@ -56,15 +52,6 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
     assert "expected absolute error" in done.out
 
 
-@pytest.mark.usefixtures("given_scales")
-def test_a_wrong_distance_is_warned_of(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(sockets)
-    options = *SOCKETS[:2], "--distance", "a,b=60", *SOCKETS[4:]
-    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "warned.safetensors")
-    assert done.code == 0
-    assert "the known distance of the sockets 'spot" in " ".join(done.err.split())
-
-
 WIRE = ["--reading", "distance=wire", "--session", "anchor"]
 
 
@@ -107,8 +94,6 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
-        (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
-        (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),
@@ -157,28 +142,6 @@ def mixed(mixtures: Path) -> Path:
     return mixtures / "mixed.safetensors"
 
 
-def test_other_commands_name_the_ball_and_what_was_measured(mixed: Path, command: Command, tmp_path: Path) -> None:
-    table, out, model = mixed.with_name("t.csv"), tmp_path / "o.csv", dc.load(mixed)
-    assert isinstance(model, dc.CalibratedKinematics)
-    assert command("predict", mixed, table, *RAD, "-o", tmp_path / "p.csv").code == 0
-    header = (tmp_path / "p.csv").read_text().splitlines()[0].split(",")[6:]
-    prefixes = ("marker_", "ball_")
-    assert header == [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    places = [f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"]
-    assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
-    planned = command("plan", mixed, "-n", 3, "--draw", 20, *RAD, "-o", out)
-    assert planned.code == 0, planned.err
-    assert out.read_text().splitlines()[0].endswith(",rank,device")
-    assert "spot 1/a: " in planned.out
-    assert "held out" not in planned.out
-    corrected = command("correct", mixed, tmp_path / "p.csv", *RAD, "-o", out)
-    assert corrected.code == 0, corrected.err
-    text = " ".join(corrected.out.split())
-    said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
-    assert said is not None
-    assert 0 < float(said[2]) < 0.5 * float(said[1])
-
-
 def test_set_ups_are_evaluated_each_in_its_place(mixed: Path, command: Command, tmp_path: Path) -> None:
     """The device moves by 100 mm before the rows of b: errors stay what they are, and so does the spread in sockets."""
     header, *lines = mixed.with_name("t.csv").read_text().split("\n")
@@ -217,20 +180,3 @@ def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> 
         refused = command(*words)
         assert refused.code == 1
         assert "payload" in refused.error
-
-
-@pytest.mark.slow
-def test_masses(tmp_path: Path, command: Command) -> None:
-    """One that is a number holds for all rows; one below zero is refused."""
-    kind = kind_named("payloads")
-    table, options = kind.table("new")
-    done = command("predict", kind.file, table, *UNITS, "--payload", "4", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.err
-    written = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
-    places = torch.from_numpy(np.stack([written[axis] for axis in "xyz"], 1)) / 1e3
-    assert_close(places, kind.model.with_payload(4.0)(kind.new.q).detach()[:, 0], rtol=0, atol=1e-9)
-    header, *lines = [line.split(",") for line in table.read_text().splitlines()]
-    lines[1][header.index("payload")] = "-5"
-    (tmp_path / "t.csv").write_text("\n".join(map(",".join, [header, *lines])) + "\n")
-    done = command("evaluate", kind.file, tmp_path / "t.csv", *options)
-    assert "line 3, column 'payload': expected a mass of 0 or more, got '-5'" in done.error

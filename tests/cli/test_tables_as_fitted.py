@@ -1,7 +1,5 @@
 """Commands with a model read a table as that of the model's fit; options that are typed win."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace
@@ -58,13 +56,6 @@ def test_options_that_are_none_are_one_error(words: str) -> None:
         as_at_the_fit(command, Rows())
     whole = Rows(position=["a,b,c"], length="m", angle="rad")
     assert as_at_the_fit(command, whole) == whole  # nothing of it is needed
-
-
-def test_a_separator_that_is_none_is_one_error(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("q1,x,y,z\n")
-    rows = as_at_the_fit("diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep 'ab'", Rows())
-    with pytest.raises(InputError, match="`sep`: expected one character"):
-        rows_in_table(tmp_path / "t.csv", rows)
 
 
 @pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])

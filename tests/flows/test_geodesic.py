@@ -2,17 +2,7 @@
 
 import pytest
 import torch
-from math_bank import (
-    CASES,
-    NAMES,
-    Case,
-    case_named,
-    central_difference,
-    naive_rk4,
-    normal,
-    rows_jacobian,
-    slopes,
-)
+from math_bank import CASES, NAMES, Case, case_named, central_difference, naive_rk4, normal, rows_jacobian, slopes
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -33,9 +23,6 @@ def start(case: Case, size: float = 0.3) -> Tensor:
 def flow_of(case: Case, integrator: Integrator, size: float = 0.3, *, variational: bool = False) -> Flow:
     q, a = start(case, size)
     return Flow(case.kernel, q, a, integrator, variational=variational)
-
-
-# --- controls -------------------------------------------------------------------------------------------------------
 
 
 @every_case
@@ -91,9 +78,6 @@ def test_nodes_and_discrete_adjoint_are_those_of_the_naive_integration(case: Cas
     ):
         found.append(torch.autograd.grad((weight * end + 0.5 * end**2).sum(), live)[0])
     torch.testing.assert_close(*found, rtol=1e-12, atol=1e-12)
-
-
-# --- passive points -------------------------------------------------------------------------------------------------
 
 
 @every_case

@@ -1,7 +1,5 @@
 """Sums that torch follows: transforms, forward-mode derivatives, parameters of profiles; and any profile of a user."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest
@@ -77,19 +75,6 @@ class Hidden(Profile):
 
     def derivative(self, r2: Tensor, order: int) -> Tensor:
         return (-(r2 * self.where[0])).exp() * (-self.where[0]) ** order
-
-
-@torch_backends
-def test_a_parameter_of_a_profile_under_torch_func(backend: Backend) -> None:
-    def energy(alpha: Tensor) -> Tensor:
-        return (A * RadialKernel(Hidden(alpha)).using(backend).field(None, Q, A)).sum()
-
-    def expected(alpha: Tensor) -> Tensor:
-        return (A * ((-squared_distances(Q, Q) * alpha).exp() @ A)).sum()
-
-    alpha = torch.tensor([0.3, 0.8], dtype=torch.float64)
-    for transform in (torch.vmap, lambda f: torch.vmap(torch.func.grad(f))):
-        torch.testing.assert_close(transform(energy)(alpha), transform(expected)(alpha), rtol=1e-10, atol=1e-10)
 
 
 @torch_backends

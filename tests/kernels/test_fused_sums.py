@@ -1,13 +1,10 @@
 """Fused sums: they equal sums over one matrix, whatever the threads, the processor's vectors, and what is installed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from functools import cache
 from pathlib import Path
@@ -47,9 +44,6 @@ def test_vectors_of_every_width(lanes: int, monkeypatch: pytest.MonkeyPatch) -> 
     assert_same(fused(FULL, GaussianProfile(), None, j), Dense().reduce(FULL, GaussianProfile(), None, j), 1e-11)
 
 
-# --- The exponential ---------------------------------------------------------------------------------------------
-
-
 def test_the_exponential_is_exact_to_rounding() -> None:
     """From 1 down to the smallest normal numbers, and beyond; the argument itself is rounded, too."""
     r = torch.linspace(0.0, 60.0, 4001, dtype=torch.float64)[:, None]
@@ -75,9 +69,6 @@ def test_points_that_are_far_away_add_nothing() -> None:
     i.features[:] = 1e100
     for nu in (1.5, 3.5):
         assert not any(bool(t.any()) for t in fused(GRADIENT, MaternProfile(nu), i, j))
-
-
-# --- Profiles of a user ------------------------------------------------------------------------------------------
 
 
 def test_numbers_of_a_profile_are_noticed_when_they_change_but_not_compiled_for_ever(
@@ -106,9 +97,6 @@ def test_what_cannot_be_compiled_is_left_to_others() -> None:
         assert Fused().reduce(FIELD, GaussianProfile(), None, unusual) is None
         expected = Dense().reduce(FIELD, GaussianProfile(), None, unusual)
         assert_same(backends.evaluate(FIELD, GaussianProfile(), None, unusual, "fused"), expected, 1e-12)
-
-
-# --- Compiling ----------------------------------------------------------------------------------------------------
 
 
 def test_compiled_code_is_kept_and_damaged_files_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,18 +144,6 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
         sums._missing.cache_clear()
-
-
-def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The functions of a second one would end with it, and the process with them."""
-    monkeypatch.setattr(sums, "_machine", cache(lambda: time.sleep(0.05) or object()))
-    found: list[object] = []
-    threads = [threading.Thread(target=lambda: found.append(sums.machine())) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(one is sums.machine() for one in found)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")

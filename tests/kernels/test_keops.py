@@ -4,8 +4,6 @@ Every formula is compiled with one profile, the other operations of profiles wit
 7 s where KeOps' cache folder is empty.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -85,9 +83,6 @@ def test_tiled_sums_replace_keops_where_gradients_are_needed(live: int) -> None:
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=1e-12)
 
 
-# --- The environment ----------------------------------------------------------------------------------------------
-
-
 def in_a_process(code: str, **environment: str) -> Any:
     """Run code in a separate process with these variables, without the user's for KeOps; return its output as JSON."""
     kept = {k: v for k, v in os.environ.items() if k not in ("CXX", "CXXFLAGS", "KEOPS_CACHE_FOLDER")}
@@ -122,13 +117,6 @@ def test_import_is_late_and_silent_and_leaves_the_environment_alone(tmp_path: Pa
     assert other != folder
     assert Path(other).is_dir()
     assert in_a_process(LOAD, KEOPS_CACHE_FOLDER=str(tmp_path / "own"))[-1] == str(tmp_path / "own")
-
-
-def test_without_a_folder_that_can_be_made_there_is_one_for_the_process() -> None:
-    code = "import warnings\nwarnings.simplefilter('ignore')" + LOAD
-    folder = Path(in_a_process(code, XDG_CACHE_HOME="/dev/null")[-1])
-    assert folder.name.startswith("diffeo_calib-")
-    assert not folder.exists()
 
 
 FALL_BACK = """
