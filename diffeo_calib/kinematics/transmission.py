@@ -49,10 +49,8 @@ def _configurations(robot: Tree, joint: str, values: object) -> tuple[Tensor, in
     return x, index
 
 
-SAME_RATIO = 0.5
-"""Difference of two frequencies, rad per rad, up to which one counts as a multiple of the other."""
-MULTIPLES = (2, 3, 4)
-"""Waves per turn of the motor that are named."""
+SAME_RATIO = 0.5  # difference of two frequencies, rad per rad, up to which one counts as a multiple of the other
+MULTIPLES = (2, 3, 4)  # waves per turn of the motor that are named
 
 
 @dataclass(frozen=True)

@@ -70,18 +70,6 @@ def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign, mea
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
-def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
-    q, y = (part[:18].clone() for part in measured)
-    y[15] += 50 * MM
-    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(20, seed=8), background=True)
-    campaign.add(q, y)
-    campaign.repeat(17)
-    campaign.wait()
-    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
-    assert [one.row for one in campaign.verdicts if not one.accepted] == [15, 17]
-    assert [one.row for one in campaign.verdicts if one.again] == [17]
-
-
 def test_rows_that_give_no_model_are_tried_once(
     measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,8 +280,7 @@ def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, meas
         assert campaign.reached == (needed == 0)
         assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
         assert needed is None or campaign.next(1).needed == needed
-    campaign._make(campaign.table, campaign.verdicts)  # around all rows, with the same scales
-    campaign.poll()
+    campaign._make()  # around all rows, with the same scales
     assert (campaign._model.count, campaign._next_scales(campaign._model)) == (ROWS, pytest.approx(2.0 * 20))
     assert 1.1 < campaign.error_limit / campaign.expected_error < 2
     few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)

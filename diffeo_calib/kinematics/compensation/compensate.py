@@ -29,28 +29,26 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.problem import (
-    CODE,
-    MEMBERS,
     SLIDE_BOUND,
     TURN_BOUND,
+    Box,
     CompensationProblem,
     Solution,
     Status,
+    box_search,
     by_joint,
     joint_limits,
     mobilities,
+    reached,
 )
-from diffeo_calib.kinematics.compensation.search import Box, box_search, reached
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, checked_targets, finite_rows, tool_functions
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 
-BOUND_FACTOR_BETWEEN_ROWS = 10.0
-"""Default bounds where rows start at the row before, in units of the usual ones."""
+BOUND_FACTOR_BETWEEN_ROWS = 10.0  # default bounds where rows start at the row before, in units of the usual ones
 LEAST_DIRECTION = 1e-3
 """Motion of a tool in a direction, as a share of its largest one, below which slides do not move it there."""
-ROWS_PER_BOUND = 0.1
-"""Default rate of a path without times, in bounds per row."""
+ROWS_PER_BOUND = 0.1  # default rate of a path without times, in bounds per row
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -239,8 +237,7 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
     if not goals.of_tips:
         return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}
     if tool is None:
-        usual = model.tool_tip or tips[0]
-        return {tip: model.tool if tip == usual else tool_transform(None) for tip in tips}
+        return {tip: tool_transform(None) for tip in tips} | {model.tool_tip or tips[0]: model.tool}
     given = real_tensor(tool, "tool")
     if given.shape not in ((len(tips), 4, 4), (len(tips), 3)):
         expected, fix = f"({len(tips)}, 4, 4) or ({len(tips)}, 3)", "pass one tool for every tip"
@@ -249,7 +246,7 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
 
 
 def _result(problem: CompensationProblem, solution: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
-    goals, status = problem.targets, tuple(MEMBERS[code] for code in solution.codes.tolist())
+    goals, status = problem.targets, tuple(map(Status, solution.status.tolist()))
     (miss, angle), poses = goals.misses(solution.poses), solution.poses
     miss, angle = np.where(goals.free, np.nan, miss), None if angle is None else np.where(goals.free, np.nan, angle)
     if not goals.of_tips:
@@ -260,8 +257,7 @@ def _result(problem: CompensationProblem, solution: Solution, jumps: Sequence[in
 
 
 ROUNDS = 3
-SAME_CORRECTION_TOLERANCE = 1e-9
-"""Corrections that differ by more than this, rad or m, are not the same."""
+SAME_CORRECTION_TOLERANCE = 1e-9  # corrections that differ by more than this, rad or m, are not the same
 
 ROUNDING = 1e-14
 
@@ -302,15 +298,14 @@ def _lowest(values: Array, steps: Array) -> Array:
 
 def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Array]:
     """Commands of a path, and the rows at which the corrections of the rows on their own jump."""
-    solution = problem.solve()
-    start = problem.start
+    solution, start = problem.solve(), problem.start
     jumps = pace.jumps(solution.q - start)
-    firm = solution.codes == CODE[Status.reached]
+    firm = solution.status == Status.reached.value
     q, held = solution.q.copy(), np.zeros(solution.q.shape, dtype=bool)
     for _ in range(ROUNDS):
         slow = start + pace.limited(q - start, firm)
-        held |= np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
-        rows = np.flatnonzero((np.abs(slow - q) > SAME_CORRECTION_TOLERANCE).any(1))
+        changed = np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
+        held, rows = held | changed, np.flatnonzero(changed.any(1))
         if not len(rows):
             break
         part, still = problem.started(rows, start[rows]), held[rows]
@@ -326,24 +321,24 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
 
 def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solution:
     """Poses and statuses of the commands that differ from those of the rows on their own."""
-    rows = np.flatnonzero((np.abs(q - before.q) > 0).any(1))
-    poses, codes = before.poses.copy(), before.codes.copy()
+    rows = np.flatnonzero((q != before.q).any(1) & np.isfinite(q).all(1))
+    poses, status = before.poses.copy(), before.status.copy()
     if len(rows):
         poses[rows] = problem.tool.poses(q[rows])
         there = reached(problem.targets.take(rows), poses[rows])
         slowed = (np.abs(q[rows] - before.q[rows]) > SAME_CORRECTION_TOLERANCE).any(1)
-        codes[rows[there]] = CODE[Status.reached]
-        codes[rows[~there & slowed]] = CODE[Status.rate]
-    return Solution(q, poses, codes)
+        status[rows[there]] = Status.reached.value
+        status[rows[~there & slowed]] = Status.rate.value
+    return Solution(q, poses, status)
 
 
 def follow(problem: CompensationProblem, first: Array) -> tuple[CompensationProblem, Solution]:
     """The problem whose rows start at the command of the row before, the first at ``first`` (n,), and its solution."""
-    rows, at = [], first
-    starts = np.empty((len(problem.targets), len(first)))
-    for row in range(len(starts)):
-        starts[row] = at
-        rows.append(problem.started(np.array([row]), at[None]).solve())
-        at = rows[-1].q[0] if np.isfinite(rows[-1].q).all() else at
-    solution = Solution(*(np.concatenate(parts) for parts in zip(*rows, strict=True))) if rows else problem.solve()
-    return problem.started(np.arange(len(starts)), starts), solution
+    rows, starts = [], [first]
+    for row in range(len(problem.targets)):
+        rows.append(problem.started(np.array([row]), starts[-1][None]).solve())
+        starts.append(rows[-1].q[0] if np.isfinite(rows[-1].q).all() else starts[-1])
+    if not rows:
+        return problem, problem.solve()
+    every = problem.started(np.arange(len(rows)), np.stack(starts[:-1]))
+    return every, Solution(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
