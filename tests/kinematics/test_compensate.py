@@ -248,7 +248,7 @@ def test_no_rows_and_wrong_input(arm: Case) -> None:
             dc.compensate(**given)  # pyright: ignore[reportArgumentType]
 
 
-# --- paths: corrections that change slowly, jumps that are named, commands that start at the row before -------------
+# --- paths: corrections that change slowly, jumps that are named ---------------------------------------------------
 
 
 def line(case: Case, rows: int, seed: int = 3) -> Tensor:
@@ -319,14 +319,3 @@ def test_the_slowest_change_of_a_jump() -> None:
     kept = pace.limited(spike, firm)[:, 0]
     assert np.isnan(kept[4])
     assert not np.delete(kept, 4).any()
-
-
-def test_one_start_for_a_whole_path(arm: Case) -> None:
-    q = line(arm, 12)
-    targets = intended(arm, q)
-    found = dc.compensate(arm.model, targets, q[0], tool=tool_frame())
-    assert bool(found.reached.all())
-    torch.testing.assert_close(found.start[1:], found.q[:-1], rtol=0, atol=0)
-    torch.testing.assert_close(found.start[0], q[0], rtol=0, atol=0)
-    every = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    torch.testing.assert_close(found.q, every.q, rtol=0, atol=1e-7)

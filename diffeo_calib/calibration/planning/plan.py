@@ -122,11 +122,6 @@ class Plan:
         """Some numbers of poses up to that of the plan, at which to look at ``expected_rms``."""
         return (*(count for count in COUNTS if count < len(self)), len(self))
 
-    def needed(self, rms: float) -> int | None:
-        """The least number of planned poses that brings the expected RMS down to ``rms`` [m]; None if none does."""
-        good = (self.expected_rms <= rms).nonzero()
-        return int(good[0]) if len(good) else None
-
     def to_csv(
         self, path: str | PathLike[str], *, length: str = "m", angle: str = "rad", sep: str = ",", decimal: str = "."
     ) -> None:
