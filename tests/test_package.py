@@ -14,7 +14,6 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from command_bank import Command
 from hatchling.builders.wheel import WheelBuilder
 from lxml import html
 from product_bank import Case, simulated, with_usual_scales
@@ -208,19 +207,6 @@ def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFix
     assert found[places[-1]] == "rows that look wrong and hardly count: 7"
     assert f"model written to {tmp_path}/arm.safetensors" in found
     assert "judged by 20 rows it has not seen, 20 were used before" in found
-
-
-def test_the_command_line_shows_them_with_verbose(command: Command, tmp_path: Path) -> None:
-    arm, *_ = simulated(1)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    plan = ["plan", "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange", "-n", 5, "--draw", 50]
-    quiet = command(*plan, "--length", "mm", "--angle", "deg", "-o", tmp_path / "a.csv")
-    asked = command("--verbose", *plan, "--length", "mm", "--angle", "deg", "-o", tmp_path / "b.csv")
-    assert (quiet.code, asked.code) == (0, 0)
-    assert "5 poses chosen of 50" not in quiet.err
-    assert "5 poses chosen of 50" in asked.err
-    assert not logging.getLogger("diffeo_calib").isEnabledFor(logging.INFO)
-    assert len(logging.getLogger("diffeo_calib").handlers) == 1
 
 
 # --- notebooks --------------------------------------------------------------------------------------------------------

@@ -93,14 +93,6 @@ def test_small_pieces() -> None:
     assert not found, "\n".join(found)
 
 
-def test_big_pieces_are_found() -> None:
-    names = ", ".join("abcdefghi")
-    long = f"def f({names}):\n" + MOST_CODE_LINES * "    a = b\n" + MOST_LINES * "\n"
-    found = [text.partition(": ")[2] for text in too_big(Path("f.py"), long)]
-    assert found == ["561 lines: split the file by subject", "61 lines of code: split f", "group the parameters of f"]
-    assert not list(too_big(Path("f.py"), f"class Problem:\n    def __init__(self, {names}):\n        pass\n"))
-
-
 VAGUE, MOST_USES = ("found", "known", "one", "own", "seen", "told"), 150
 """Words that say nothing of what a name holds, and how often the package may use each as one."""
 

@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import Length
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import Placed
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.placing.readings import ReadingDevices
+from diffeo_calib.calibration.placing.readings import ReadingDevices, SocketDevices
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.common.data_frames import table_html

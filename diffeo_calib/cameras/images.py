@@ -34,6 +34,7 @@ from diffeo_calib.cameras.board import (
     towards,
 )
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
 UNKNOWNS = (*LENS, *BOARD)
@@ -47,6 +48,8 @@ PRIOR_IMAGE_CORNERS = 10.0
 """Corners of a usual image whose noise counts beside an image's own."""
 CENTRE_SHARE, FOCAL_SHARE = 0.25, 1.0
 """Prior deviations of the principal point relative to the image's width, and of focal lengths."""
+CHANGED_PROBABILITY = 1e-3
+"""Of a difference as large between lenses and boards of two dates that are the same, below which they are others."""
 BOARD_DIGITS = 7
 """Decimal places, m, of corners of a board that are the same."""
 EDGE_SHARE = 1.02
@@ -145,6 +148,15 @@ class Camera:
             f"board: scale {1e6 * value[k]:+.0f} +- {1e6 * std[k]:.0f} ppm, x against y {2e6 * value[k + 1]:+.0f} +- "
             f"{2e6 * std[k + 1]:.0f} ppm, bent {bends} mm; lengths in the images are the board's"
         )
+
+    def alike(self, other: Camera) -> bool:
+        """Whether lens and board of an earlier camera may be the same, by the uncertainty of both."""
+        mine, theirs = ((c.width, c.height, round(c.half_size, BOARD_DIGITS)) for c in (self, other))
+        deviations = (self.deviations.square() + other.deviations.square()).sqrt()
+        away = ((self.unknowns - other.unknowns) / deviations).nan_to_num(0.0)
+        roots = (torch.cat([self.root, other.root], 1) / deviations[:, None]).nan_to_num(0.0)
+        square = away @ torch.linalg.pinv(roots @ roots.mT, hermitian=True) @ away
+        return mine == theirs and float(square) < chi2_above(CHANGED_PROBABILITY, len(away))
 
     def held(self) -> Camera:
         """Hold the lens at its values."""

@@ -181,7 +181,7 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, 
             unit = measured.angle if len(turn) == 3 else None
             more |= {"rotation": [",".join(turn)], "convention": measured.convention, "rotation_angle": unit}
         with quiet(), suppress(DiffeoCalibError):
-            robot = cartesian(read_poses(sheet.path, table_format(Units(**given, **sheet.marks))))
+            robot = cartesian(read_poses(sheet.path, table_format(Units(**given, **sheet.marks)))[1])
             yield source_of(sheet, robot, rows, **given, **more)
 
 

@@ -15,13 +15,13 @@ from diffeo_calib.cli.options import Links, Robot, Rows
 from diffeo_calib.cli.tables import Given, MeasuredTable, as_at_the_fit, measured_table, rows_in_table, stated_numbers
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import PROGRAM, read_regular
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import POINTS, by_frame, rotation_matrices
-from diffeo_calib.measurements.table_format import TableFormat, numbers_of
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.tree import Tree
@@ -57,7 +57,7 @@ def robot_of(given: Robot, source: MeasuredTable) -> Tree:
         if given.robot is not None or any(getattr(given, name) for name in Links.names()):
             what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"
             raise InputError.of(what, expected="joint values, or poses", got="both", fix=fix)
-        return cartesian(read_poses(source.csv, source.table))
+        return cartesian(read_poses(source.csv, source.table)[1])
     if given.robot is None:
         expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
         fix = "of several lines that a campaign file proposes, uncomment one"
@@ -105,7 +105,11 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
 def as_fitted(model: CalibratedKinematics, given: Given) -> Given:
     """Options of a command with a model, completed by those of the command that made it."""
     made = model.provenance
-    return as_at_the_fit("" if made is None else made.command or made.table, given)
+    given = as_at_the_fit("" if made is None else made.command or made.table, given)
+    unit = given.joint_length or given.length
+    if made is not None and made.program_rows and unit and PROGRAM in (given.robot_pose or ""):
+        PoseColumns.of(given.robot_pose or "").check_program(made.program_rows, UNITS_PER_METRE[unit])
+    return given
 
 
 def table_of(model: CalibratedKinematics, csv: Path, given: Rows) -> MeasuredTable:
@@ -118,11 +122,13 @@ def table_of(model: CalibratedKinematics, csv: Path, given: Rows) -> MeasuredTab
     return measured_table(csv, rows)
 
 
-def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
-    """The model with the command that runs in its provenance."""
-    if model.provenance is None:
+def made_by_command(model: CalibratedKinematics, source: MeasuredTable | None = None) -> CalibratedKinematics:
+    """The model with the command that runs in its provenance, and with what a function made of rows of its table."""
+    if (made := model.provenance) is None:
         return model
-    return model.changed(provenance=replace(model.provenance, command=command_line()))
+    if source is not None and isinstance(columns := source.table.joints, PoseColumns) and columns.is_program:
+        made = replace(made, program_rows=columns.program_rows(*read_poses(source.csv, source.table)))
+    return model.changed(provenance=replace(made, command=command_line()))
 
 
 def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -24,8 +24,7 @@ import torch
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register_sockets, registered_geometry, spread
-from diffeo_calib.calibration.placing.readings import images_error, rough_error
-from diffeo_calib.calibration.placing.sockets import resting_rows
+from diffeo_calib.calibration.placing.readings import images_error, resting_rows, rough_error
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.declarations import FitOptions
 from diffeo_calib.cli.guesses import (
@@ -161,7 +160,7 @@ class Source:
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows, at several places")
             return left / max(spread(session.points), SMALLEST_SPREAD_M)
         tables = self.data.parts
-        if (resting := resting_rows(tables)) is not None:
+        for resting in resting_rows(tables):
             rests = register_sockets(self.robot, resting.q, resting.device)
             ball = rests.positions[resting.device]
             around = float((ball - ball.mean(0)).norm(dim=1).median())

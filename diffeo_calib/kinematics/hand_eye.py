@@ -23,6 +23,7 @@ from diffeo_calib.kinematics.device_readings import own_shifts
 from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
+from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
@@ -122,11 +123,15 @@ class HandEye:
 
     @classmethod
     def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
-        """Result where the model's images, or the command that made it, say where the camera is; else nothing."""
+        """Result where the model's images, or the command that made it, say where the camera is; else nothing.
+
+        Beside commanded poses, measured ones are of a frame on the tool that a camera sees.
+        """
         made, cameras = model.provenance, [camera for devices in model.placement for camera in devices.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
         on_tool = cameras[0].on_tool if cameras else "--camera-on-tool" in words
-        seen_board = bool(model.lever) and (bool(cameras) or on_tool or "--robot-pose" in words)
+        commanded = is_cartesian(model.robot) and not turns_nowhere(model.robot)
+        seen_board = bool(model.lever) and bool(cameras or on_tool or commanded)
         if not seen_board or model.registration:
             return {}
         return cls.of_each(model, camera_on_tool=on_tool)

@@ -27,6 +27,8 @@ class Provenance:
         note: text of the user, such as a serial number.
         command: the command line that made the model; empty if it was made from Python.
         table: options with which the command line reads the table again; empty where they are not known.
+        program_rows: of a function that made the poses of the machine, some rows of what it took, and behind them the
+            places or poses that it made of them, m.
     """
 
     date: str
@@ -35,6 +37,7 @@ class Provenance:
     note: str = ""
     command: str = ""
     table: str = ""
+    program_rows: tuple[tuple[float, ...], ...] = ()
 
     @classmethod
     def now(cls, measurements: Any, note: str = "") -> Provenance:

@@ -162,13 +162,6 @@ class ImageTable(RowGroups):
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{camera}/") else f"{camera}/{name}" for camera, name in pairs]
 
-    def sees_board_from_tool(self, *, commanded: bool = False) -> bool | None:
-        """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board.
-
-        Beside ``commanded`` poses, measured ones are of a frame on the tool that a camera sees.
-        """
-        return True if self.board is not None else False if self.cameras or (commanded and self.lever) else None
-
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Errors that images share; none of other rows."""
         shared, covariance, lever = self.pose_shared, self.pose_covariance, self.lever
@@ -215,6 +208,20 @@ class ImageTable(RowGroups):
         table = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
         columns = {name: getattr(table, name) for name in ("q", "poses", "points", "board")}
         return with_attributes(self, **columns, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
+
+    def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
+        """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ."""
+        pairs = [(camera, cameras.get(name)) for name, camera in self.cameras.items()]
+        if self.corners is None or not pairs or not all(old is not None and camera.alike(old) for camera, old in pairs):
+            return self
+        known = {name: cameras[name] for name in self.cameras}
+        names, on_tool = self.camera_names, self.board is not None
+        again = self.from_images(
+            self.q, self.corners, known, self.joint_names, seen_by=names, camera_on_tool=on_tool, doubt=False
+        )
+        columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
+        columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
+        return with_attributes(self, **columns)
 
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.

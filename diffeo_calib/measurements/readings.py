@@ -19,7 +19,7 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowGroups, set_attributes, with_attributes
+from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE, RowGroups, set_attributes, with_attributes
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
@@ -54,6 +54,8 @@ class Readings(RowGroups):
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
     NUMBERED = "device", "names"
     flattery = FLATTERY
+    fewest = FEWEST_PER_DEVICE
+    """Rows of a device from which its place is found."""
     blocks = ()
     """Known distances between devices, see :attr:`Sockets.blocks`."""
 

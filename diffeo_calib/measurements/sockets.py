@@ -111,7 +111,7 @@ class SocketReadings(Readings):
     """
 
     ALIKE = (*Readings.ALIKE, "distances", "distance_std")
-    flattery = FLATTERY
+    flattery, fewest = FLATTERY, 2
 
     distances: tuple[tuple[str, str, float], ...] = ()
     distance_std: float | None = None

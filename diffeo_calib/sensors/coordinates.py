@@ -26,7 +26,7 @@ from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
-from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.tables import Coordinates, with_positions
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -82,6 +82,12 @@ def known_devices(model: object) -> dict[str, Any]:
 def mounted_of(model: Any) -> SetUps:
     """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
     return mounted_kind(model.lever).among(known_devices(model), model.turns)
+
+
+def with_earlier_cameras(data: Any, model: Any) -> Any:
+    """New rows with what a calibrated model knows of the cameras that saw their boards."""
+    cameras = {name: one.camera for devices in model.placement for name, one in devices.cameras.items()}
+    return with_positions(data, lambda part: part.with_earlier(cameras)) if cameras else data
 
 
 LARGEST_SHARE = 0.5

@@ -23,7 +23,6 @@ from diffeo_calib.maps.observation import Observation, ReadPoints
 from diffeo_calib.measurements.checks import numbers_of, rare_names
 from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
-from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import skew
 
@@ -391,11 +390,11 @@ class Devices(Extrinsics):
 
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed: a plane, a fixed point or a camera takes three to six numbers."""
-    short = rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_PER_DEVICE)
+    short = rare_names(data.device_names, data.line_numbers.tolist(), data.fewest)
     if short:
         fix = "check the names in these rows, measure more rows of them, or leave them out"
-        expected = f"at least {FEWEST_PER_DEVICE} rows of each device"
-        raise MeasurementError.of("`readings`", expected=expected, got=few(short), fix=fix)
+        expected = f"at least {data.fewest} rows with each name"
+        raise MeasurementError.of(f"{data.kind}s", expected=expected, got=few(short), fix=fix)
 
 
 def refuse_first(rows: Tensor, what: str, fix: str) -> None:

@@ -12,13 +12,7 @@ from math_bank import normal
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.reductions.formulas import (
-    FIELD,
-    FIELD_AND_JACOBIAN,
-    GRADIENT,
-    HESSIAN_PRODUCT,
-    Points,
-)
+from diffeo_calib.kernels.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT, Points
 
 ROWS, COLUMNS, FEATURES, OUTPUTS = 7, 5, 3, 2
 FAR = float(1 << 20)

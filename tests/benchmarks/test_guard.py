@@ -6,7 +6,6 @@ import copy
 from pathlib import Path
 
 import guard
-import guard_placing
 import pytest
 
 BASELINE = Path(guard.__file__).parent / "baselines" / "guard.json"
@@ -68,17 +67,3 @@ def test_a_verb_that_is_slower_or_worse_on_the_whole_is_found(recorded: guard.Ca
         *("compare", "plan", "recalibrate"),
         "the geometric mean of errors",
     ]
-
-
-def test_what_is_better_passes_and_is_written(recorded: guard.Cases, tmp_path: Path) -> None:
-    better, path = copy.deepcopy(recorded), tmp_path / "better.json"
-    better[CASE]["error"] = [0.5 * value for value in better[CASE]["error"]]
-    guard.write(path, better)
-    assert guard.cases(guard.read(path)) == guard.cases(guard.read(path, path))
-    assert guard.run(guard.arguments(["--read", str(path), "--against", str(BASELINE)])) == 0
-    assert guard.run(guard.arguments(["--read", str(BASELINE), "--against", str(path)])) == 1
-
-
-@pytest.mark.parametrize("kind", ["positions", "poses", "heights"])
-def test_places_from_far_are_found(kind: str) -> None:
-    assert guard_placing.outcome(kind, 2)[0] == "right"

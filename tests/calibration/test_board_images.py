@@ -56,6 +56,24 @@ def test_lens_and_board_are_found_with_the_robot() -> None:
     assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
 
 
+def test_what_a_model_knows_of_the_lens_counts_until_it_changes() -> None:
+    known, count, truth = calibrated().model.placement[0].cameras["camera"].camera, 20, true_camera()
+    q, corners = arm().shown(0.1, 11)
+    new = of_corners(corners[:count], q[:count])
+    again = new.with_earlier({"camera": known})
+    assert bool((again.camera.deviations <= 1.001 * known.deviations).all())
+    assert float(((again.camera.unknowns - truth.unknowns) / again.camera.deviations).abs().max()) < 4.5
+    before, after = ((each.points - arm().arm.true_points(each.q)).square().mean().sqrt() for each in (new, again))
+    assert float(after) < 0.85 * float(before)
+    assert again.sha256 == new.sha256
+    focused = truth.unknowns.clone()
+    focused[:2] *= 1.005
+    q, corners = replace(arm(), camera=replace(truth, unknowns=focused)).shown(0.1, 11)
+    other = of_corners(corners[:count], q[:count])
+    assert other.with_earlier({"camera": known}) is other
+    assert new.with_earlier({"left": known}) is new
+
+
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
     corners: Any = data().corners
     wrong = corners.clone()

@@ -111,7 +111,10 @@ def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:
     loaded = tracked.with_payload(1.0)
     refused(
         ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
-        (r"at least 2 rows in every socket.*, got '0/1' in 1 row", staged(tracked, resting.rows(slice(0, 9)))),
+        (
+            r"sockets: expected at least 2 rows with each name, got '0/1' in 1 row",
+            staged(tracked, resting.rows(slice(0, 9))),
+        ),
         ("positions seem to be 1000 times too large", staged(large, resting)),
         ("rows with sockets: expected no payloads", staged(loaded, resting.with_payload(0.0))),
         ("the tables differ in payload", staged(loaded, resting)),

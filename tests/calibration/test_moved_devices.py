@@ -152,7 +152,7 @@ def test_the_gain_is_that_of_the_definition() -> None:
         g, H = B.T @ inverse @ r, B.T @ inverse @ B
         gains.append(float(g @ torch.linalg.solve(H, g)))
     jump, _ = changes([Hypothesis("any", effects)], data.process(setting.scales), order)
-    assert jump.row == CHANGE_ROWS + int(np.argmax(gains))
+    assert jump.rows == (CHANGE_ROWS + int(np.argmax(gains)),)
     left = (float(r @ inverse @ r) - max(gains)) / len(r)
     assert jump.gain == pytest.approx(max(gains) / max(1.0, left), rel=1e-5)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    Reading,
     conventions_of,
     likely_mistake,
     other_columns,
@@ -122,7 +123,9 @@ def test_a_wrong_column(tmp_path: Path) -> None:
     names[1] = "load"
     read = read_table(path, names, XYZ, table, kinds=arm.nominal.kinds)
     right = [
-        one for one in other_columns(arm.nominal, read) if "'shoulder_joint' fits as shoulder_joint in pl" in one.words
+        one
+        for one in other_columns(Reading.of(arm.nominal, read), read)
+        if "'shoulder_joint' fits as shoulder_joint in pl" in one.words
     ]
     torch.testing.assert_close(right[0].q, data.q, rtol=1e-12, atol=1e-12)
     for changed in (lambda: path.write_text("another file\n"), path.unlink):
@@ -177,25 +180,6 @@ def test_joints_of_a_slide() -> None:
     assert advice(robot, data) == ""
     read = dc.Measurements(with_joint(data.q, 2, 1e-3), data.points)
     assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
-
-
-@pytest.mark.slow
-def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:
-    """A column in the place of a coordinate has values where the marker is hidden."""
-    arm = SimulatedArm(seed=1, markers=3)
-    q, points = arm.measure(30, seed=2)
-    q[:, 2] += q[:, 1]
-    points[[3, 8, 20], [0, 1, 2]] = torch.nan
-    path, table = tmp_path / "t.csv", TableFormat("mm", "deg")
-    write_measurements(path, dc.Measurements(q, points, arm.nominal.joint_names), table)
-    lines = [f"{line},{'marker1_x2' if row == 0 else row}" for row, line in enumerate(path.read_text().splitlines())]
-    path.write_text("\n".join(lines) + "\n")
-    read = read_table(path, arm.nominal, [[f"marker{k}_{axis}" for axis in XYZ] for k in (1, 2, 3)], table)
-    replaced = [one for one in other_columns(arm.nominal, read) if "'marker1_x2' fits in place" in one.words]
-    assert replaced
-    for one in replaced:
-        assert torch.equal(one.points.isnan(), points.isnan())
-    assert "-{shoulder_joint}+{elbow_joint}" in advice(arm.nominal, read)
 
 
 # --- signs, zeros, couplings and units of joint values ----------------------------------------------------------------
@@ -305,16 +289,3 @@ def test_nothing_is_proposed_for_a_right_table_of_a_wrong_robot() -> None:
 def test_a_seven_axis_arm(meant: object, texts: str) -> None:
     q, points = measured(SEVEN)
     assert texts in found(SEVEN, meant(q), points)  # pyright: ignore[reportCallIssue]
-
-
-@pytest.mark.slow
-def test_meanings_that_rows_do_not_tell_apart_are_all_named() -> None:
-    """A spherical wrist: the middle joint counts the other way, or the one before it half a turn further."""
-    arm = SimulatedArm(seed=1)
-    q, points = arm.measure(40, seed=2)
-    q[:, 4] *= -1
-    data = dc.Measurements(q, points)
-    texts = [one.texts(list("abcdef"), "rad", 1.0) for one in conventions_of(arm.nominal, data, "rad")]
-    assert ["a", "b", "c", "d", "-{e}", "f"] in texts
-    assert ["a", "b", "c", "{d}+pi", "e", "f"] in texts
-    assert len(texts) == 2

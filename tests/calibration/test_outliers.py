@@ -21,13 +21,11 @@ from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
-from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
-from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.calibration.diagnostics import judged_rows
+from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, block_text, contradicted, excluded, steps_of
+from diffeo_calib.calibration.diagnostics.likely_mistakes import out_of_step
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import PLACES
@@ -92,17 +90,6 @@ def test_wrong_points_joints_and_pairings(arm: Case) -> None:
     assert found[7].distance == pytest.approx(0.05, rel=0.01)
     assert found[7].weight is not None
     assert found[7].weight < 1e-4
-
-
-def test_an_outlier_among_repeats_is_recognised(arm: Case) -> None:
-    noise = 2e-5 * torch.from_numpy(np.random.default_rng(3).standard_normal((20, 1, 3)))
-    points = torch.cat([arm.train.points, simulated(1)[0].true_points(arm.train.q[:20]) + noise])
-    points[5] += aside(0.003, 5)
-    result = with_usual_scales(arm.robot, dc.Measurements(torch.cat([arm.train.q, arm.train.q[:20]]), points))
-    (found,) = result.outliers
-    assert found.row == 5
-    assert "repeated measurements of this pose agree with the model" in found.reason
-    assert held_out(result, arm.test) < 1.3 * arm.held_out()[2]
 
 
 def test_reasons_with_three_markers() -> None:
@@ -221,7 +208,7 @@ def test_a_wrong_pose_is_named(posed: Case) -> None:
 )
 def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case) -> None:
     data = changed(arm, rows, ASIDE)
-    text = block_text(arm.model, data, contradicted(arm.model, data))
+    text = block_text(arm.model, data, judged_rows.flagged(len(data), contradicted(arm.model, data)))
     assert text.startswith(f"10 rows look wrong that follow one another: {words} a median error of 200 mm")
     assert "moving the measuring device by 200 mm" in text
 
@@ -230,15 +217,15 @@ def test_the_block_is_where_the_wrong_rows_are() -> None:
     """Random rows are rarely one."""
     generator = torch.Generator().manual_seed(1)
     for share in (0.02, 0.1, 0.3):
-        found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
+        found = [judged_rows.find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
         assert sum(place is not None for place in found) <= 2
     wrong = torch.zeros(100, dtype=torch.bool)
     wrong[40:50] = True
     wrong[[3, 77]] = True
-    assert find_block(wrong) == (40, 50)
+    assert judged_rows.find_block(wrong) == (40, 50)
     wrong[45] = False
-    assert find_block(wrong) == (40, 50)
-    assert find_block(~wrong) is None  # nearly all rows
+    assert judged_rows.find_block(wrong) == (40, 50)
+    assert judged_rows.find_block(~wrong) is None  # nearly all rows
 
 
 # --- wrong labels -----------------------------------------------------------------------------------------------------
@@ -290,17 +277,6 @@ def test_a_lone_name_is_told_by_its_row(name: str) -> None:
     data, words = with_a_lone_name(name, kind.data)
     with pytest.raises(MeasurementError, match=words):
         dc.calibrate(kind.robot, data, hyperparameters=kind.scales)
-
-
-def test_a_lone_socket_of_new_rows_is_told_by_its_row() -> None:
-    kind = kind_named("ball in sockets")
-    new, words = with_a_lone_name("ball in sockets", kind.new)
-    found = " ".join(dc.evaluate(kind.model, new).placed)
-    assert "1 of 12 rows show no error" in found
-    assert re.search(words, found)
-    for verb in (dc.recalibrate, dc.compare):
-        with pytest.warns(DiffeoCalibWarning, match=words):
-            verb(kind.model, new)
 
 
 # --- single rows in sockets -------------------------------------------------------------------------------------------
@@ -358,22 +334,6 @@ def test_a_row_in_a_socket_is_judged_as_all_others_predict_it(result: Any) -> No
     gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
     away = error[own] - gain @ error[~own]
     assert found.distance == pytest.approx(float(away.norm()), rel=1e-4)
-
-
-def test_a_plane_is_named_where_it_matters(result: Any) -> None:
-    found, expected = result.sockets, workspace_deviation(result.model.map)
-    flat = found.positions.clone()
-    flat[:, 2] = 0.2
-    tall = flat.clone()
-    tall[[0, 3], 2] = 0.9
-
-    def named(positions: Tensor, expected_error: float) -> list[str]:
-        rows = found.device, found.sockets.place, expected_error
-        return warned(warn_of_flat_places, result.model.map, positions, *rows)[1]
-
-    assert named(flat, expected) == named(tall, 10 * expected) == []
-    (large,) = named(flat, 10 * expected)
-    assert re.search("the sockets lie near a plane.*raise or tilt the block at one place", large)
 
 
 # --- rows out of step with their joints -------------------------------------------------------------------------------

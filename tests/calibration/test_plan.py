@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, sliding_robot
+from product_bank import Case
 from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.set_ups import frame_slopes
-
-MARKER = torch.tensor([[0.1, 0.0, 0.1]], dtype=torch.float64)
 
 
 def by_rank(plan: dc.Plan) -> list[int]:
@@ -113,23 +108,6 @@ def test_a_plan_can_be_made_in_parts() -> None:
     assert bool((whole.expected_rms.diff() < 0).all())
     assert "8 poses" in str(whole)
     assert "guesses" in str(whole)
-
-
-def test_many_candidates_and_targets_of_a_slide(tmp_path: Path) -> None:
-    """More targets than are followed, and two markers; the table is read back."""
-    robot = sliding_robot()
-    q = dc.candidates(robot, 320, ranges={"slide": (0.0, 0.6)})
-    plan = dc.plan(robot, q, 10, marker=[[0.1, 0.0, 0.1], [0.0, 0.1, 0.05]])
-    assert len(set(plan.rows.tolist())) == 10
-    best, drawn = (
-        dc.plan(robot, own, 10, target=q, marker=MARKER).expected_rms[-1]
-        for own in (q, dc.candidates(robot, 10, ranges={"slide": (0.0, 0.6)}))
-    )
-    assert float(best) < 0.9 * float(drawn)
-    plan.to_csv(tmp_path / "poses.csv", length="mm", angle="deg", sep=";", decimal=",")
-    read = read_joints(tmp_path / "poses.csv", TableFormat("mm", "deg", ";", ",", joints=robot))
-    assert_close(read, plan.q, rtol=0, atol=1e-8)
-    assert (tmp_path / "poses.csv").read_text().splitlines()[0].endswith("turn;rank")
 
 
 def test_expected_errors_are_those_of_the_simulated_arm(arm: Case) -> None:

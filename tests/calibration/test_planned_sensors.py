@@ -204,10 +204,6 @@ def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
 FEWEST = 4
 
 
-def wrist() -> Kind:
-    return kind_named("images of a board")
-
-
 def cameras(kind: Kind) -> list[Any]:
     return [one for one in sensor_of(kind.model) if isinstance(one, BoardImages)]
 
@@ -285,18 +281,3 @@ def test_views() -> None:
     folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
     ahead[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
     assert not bool(shown(folding, ahead[None]).any())
-
-
-@pytest.mark.slow
-def test_a_campaign_proposes_what_its_camera_sees() -> None:
-    """Of poses of the user those; else others are drawn."""
-    arm, robot = camera_arm(60), wrist().robot
-    rows, unseen = arm.images(0.1).rows(slice(0, 14)), candidates(wrist().robot, 20)
-    for own, wanted in ((None, 5), (torch.cat([rows.q[:3], unseen]), 3)):
-        campaign = dc.Campaign(robot, candidates=own, seed=1)
-        campaign.add(rows)
-        found: Any = campaign.next(5)
-        assert len(found.q) == wanted
-        assert int(corners_in_truth(found.q, arm, on_tool=True).min()) >= FEWEST
-    with pytest.raises(dc.DiffeoCalibError, match=r"candidates that can be measured: expected at least 5.*its board"):
-        dc.plan(wrist().model, unseen, 5)

@@ -169,17 +169,6 @@ def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
     assert any(re.search(r"rows are outliers.*markers (0 and 1|1 and 0) seem to be exchanged", one) for one in texts)
 
 
-@pytest.mark.slow
-def test_warnings_point_at_the_caller(arm: Case) -> None:
-    """However deep in the package they are found."""
-    overstated = dc.Measurements(arm.train.q[:30], arm.train.points[:30], std=2e-2)  # mm given as m
-    for data, word in ((arm.train.rows(slice(8)), "too few"), (overstated, "selected scales.*check `std`")):
-        with pytest.warns(DiffeoCalibWarning) as caught:
-            dc.calibrate(arm.robot, data)
-        assert any(re.search(word, str(one.message)) for one in caught)
-        assert [(str(one.message), one.filename) for one in caught if one.filename != __file__] == []
-
-
 def test_poses_commanded_in_whole_degrees_are_calibrated() -> None:
     """An elastic arm that errs by a millimetre, which steps of 1 degree would explain if they were reported so."""
     arm = SimulatedArm(seed=1, gravity=2.0)

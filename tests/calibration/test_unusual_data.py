@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from math import nan
-from typing import Any
 
 import numpy as np
 import pytest
@@ -178,49 +177,3 @@ def test_marker_that_no_row_shows_is_refused() -> None:
         dc.calibrate(arm.nominal, data.rows(slice(10, None)))
     with pytest.raises(MeasurementError, match="never show marker 1"):
         register(arm.nominal, q[10:], points[10:])
-
-
-# --- from the table to the report -------------------------------------------------------------------------------------
-
-COUNT, WRONG_ROW = 40, 7
-
-
-def three_markers(*, worn: float = 1.0) -> SimulatedArm:
-    return SimulatedArm(seed=0, markers=3).worn(2, worn)
-
-
-def with_gaps(data: dc.Measurements, seed: int, share: float = 0.3) -> dc.Measurements:
-    """The same rows without some markers."""
-    gone = torch.rand(data.points.shape[:2], generator=torch.Generator().manual_seed(seed)) < share
-    gone[gone.all(1), 0] = False
-    return dc.Measurements(data.q, data.points.masked_fill(gone[..., None], nan), data.joint_names)
-
-
-def rows(count: int, seed: int, robot: SimulatedArm | None = None) -> dc.Measurements:
-    robot = robot or three_markers()
-    return dc.Measurements(*robot.measure(count, seed=seed), robot.nominal.joint_names)
-
-
-@pytest.fixture(scope="module")
-def some() -> dc.Measurements:
-    """Rows with gaps, one of them with a wrong marker beside a hidden one."""
-    data = with_gaps(rows(COUNT, 1), 0)
-    points = data.points.clone()
-    points[WRONG_ROW] = rows(COUNT, 1).points[WRONG_ROW]
-    points[WRONG_ROW, 0], points[WRONG_ROW, 2, 1] = nan, points[WRONG_ROW, 2, 1] + 2e-3
-    return dc.Measurements(data.q, points, data.joint_names)
-
-
-@pytest.fixture(scope="module")
-def result(some: dc.Measurements) -> Any:
-    return dc.calibrate(three_markers().nominal, some)
-
-
-@pytest.mark.slow
-def test_only_the_wrong_marker_loses_its_weight(result: Any) -> None:
-    (found,) = result.outliers
-    assert (found.row, found.marker) == (WRONG_ROW, 2)
-    assert "marker 2 alone is off" in found.reason
-    weights = result.tails.weights[WRONG_ROW]
-    assert float(weights[2]) < 0.1 < float(weights[1])
-    assert float(weights[0]) == 1.0

@@ -54,10 +54,7 @@ def test_corners_are_found_to_hundredths_of_a_pixel() -> None:
     assert float(np.median(np.abs(errors))) < 0.04
 
 
-@pytest.mark.parametrize(
-    ("text", "corners"),
-    [("chessboard:7x5:0.03", 35), ("tag:0.1:DICT_APRILTAG_36h11:3", 4)],
-)
+@pytest.mark.parametrize(("text", "corners"), [("chessboard:7x5:0.03", 35), ("tag:0.1:DICT_APRILTAG_36h11:3", 4)])
 def test_other_boards_are_found(text: str, corners: int) -> None:
     numbers, pixels = Board.of(text).corners(flat(text))
     assert sorted(numbers.tolist()) == list(range(corners))

@@ -24,7 +24,6 @@ from table_bank import refused
 import diffeo_calib as dc
 from diffeo_calib.campaign.feeds import LONGEST_LINE, Inbox, as_line, check_cells, parsed, read_lines
 from diffeo_calib.campaign.journal import GrowingTable, Journal
-from diffeo_calib.cli.commands.campaign import Live
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -112,23 +111,6 @@ def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(InputError, match="not the journal"):
             Journal(path)
-
-
-def test_a_file_system_without_locks_or_fsync(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command, lines: list[str]
-) -> None:
-    """The campaign runs, and says that nothing keeps a second one away."""
-
-    def refused(*_: object) -> None:
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-    monkeypatch.setattr("fcntl.flock", refused)
-    monkeypatch.setattr(os, "fsync", refused)
-    (tmp_path / "run.csv").write_text("".join(lines[:3]))
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--accepted", tmp_path / "accepted.csv")
-    assert done.code == 0, done.err
-    assert "run no second campaign" in done.warnings[0]
-    assert (tmp_path / "accepted.csv").read_text() == "".join(lines[:3])
 
 
 def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,31 +331,6 @@ def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Ca
         return done, [json.loads(line) for line in done.out.splitlines()]
 
     return sent
-
-
-def test_lines_that_wait_at_the_target_are_judged_before_a_row_that_is_sent(
-    tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else the numbers of lines and of verdicts part, and the campaign cannot go on."""
-    monkeypatch.setattr("diffeo_calib.cli.commands.campaign.TOGETHER", 1)
-    monkeypatch.setattr(dc.Campaign, "reached", property(lambda own: 20 <= len(own) < 26))
-    path, take = tmp_path / "run.csv", Live.take
-
-    def late(live: Live, entry: Any) -> None:
-        """Another program writes just before the last row is taken."""
-        if entry["id"] == 24 and len(live.lines) == 18:
-            sent = [json.loads(row(number)) for number in range(18, 24)]
-            with path.open("a") as file:
-                names = path.read_text().splitlines()[0].split(",")
-                file.writelines(",".join(str(one[name]) for name in names) + "\n" for one in sent)
-        take(live, entry)
-
-    monkeypatch.setattr(Live, "take", late)
-    done, answers = run(map(row, [*range(18), 24]))
-    assert done.code == 0
-    assert [one["line"] for one in answers if "line" in one] == [*range(2, 27)]
-    done, answers = run([row(24)])
-    assert (done.code, answers[-2]["rows"]) == (0, 25)
 
 
 def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:

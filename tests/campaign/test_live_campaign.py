@@ -70,26 +70,6 @@ def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign, mea
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
-def test_rows_that_give_no_model_are_tried_once(
-    measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (q, y), tries = measured, []
-    still = dc.Campaign(ARM.nominal).add(q[:1].repeat(12, 1), y[:1].repeat(12, 1, 1))
-    assert "all 12 rows hold the same configuration" in still[-1].cause
-
-    def refused(_: Any, table: Any, *__: Any, **___: Any) -> None:
-        tries.append(len(table))
-        raise dc.DiffeoCalibError("these rows do not say where the device is")
-
-    monkeypatch.setattr("diffeo_calib.campaign.campaign.Around.of", refused)
-    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
-    campaign.add(q[:12], y[:12])
-    campaign.reject(0)
-    for row in (12, 13):
-        campaign.add(q[row], y[row])
-    assert tries == [12, 13]
-
-
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (part[ROWS : ROWS + 1] for part in measured)
     before = measured[0][ROWS - 1]
@@ -286,20 +266,3 @@ def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, meas
     few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
     assert few.expected_error is not None
     assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-def test_next_poses_of_a_ball_are_in_sockets() -> None:
-    kind = kind_named("ball in sockets")
-    rows, q = kind.source.rows, kind.q(30)
-    ball, own = kind.model(rows.q).detach()[:, -1], rows.device
-    sockets = torch.stack([ball[own == number].mean(0) for number in own.unique()])
-    drawn, given = begun(rows, kind.robot, target=q), begun(rows, kind.robot, candidates=q, target=q)
-    found: Any = drawn.next(5)
-    assert len(found.q) == 5
-    away = torch.cdist(kind.model(found.q).detach()[:, -1], sockets).amin(1)
-    assert float(away.max()) < 0.03
-    assert found.expected[5] < found.expected[0]
-    none: Any = given.next(5)
-    assert len(none.q) == 0

@@ -431,6 +431,7 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
         ("def f(q): return q[:4]", r"returns: expected places \(5, k\).* got \(4, 2\)"),
         ("def f(q): return 1.0", r"returns: expected places \(5, k\).* got \(\)"),
         ("def f(q): return (q - q[2:3]).log()", "of row .*2.*: expected finite numbers"),
+        *((f"def f(q): return q{how}", "of a row: expected always the same") for how in (" - q.mean(0)", ".cumsum(0)")),
     ],
 )
 def test_functions_that_are_none(
@@ -463,6 +464,17 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=" in done.error
     done = command("predict", model, "delta.csv", *pose, "-o", "p.csv")
     assert done.code == 0, done.error
+    text = Path("my_delta.py").read_text(encoding="utf-8")
+    for written, options, away in (("300.5 *", [], r"0\.\d+ mm"), ("300 *", ["--length", "m"], r".e\+05 mm")):
+        joints._names.cache_clear()
+        Path("my_delta.py").write_text(text.replace("300 *", written), encoding="utf-8")
+        done = command("evaluate", model, "delta.csv", *pose, *options)
+        assert re.search(
+            "py:kinematics: expected the function that the model was fitted with, got .*" + away, done.error
+        )
+    Path("metres.py").write_text(f"{text.replace('return elbows', 'return 1e-3 * (elbows')})", encoding="utf-8")
+    done = command("fit", "delta.csv", *pose[:1], pose[1].replace("my_delta", "metres"), *MEASURED, "-o", "w")
+    assert "1000 times too large: check their unit (--length), and that of the commanded ones" in done.error
     done = command("predict", model, "delta.csv", "--robot-pose", "q1,q2,q3", "-o", "q.csv")
     assert "type it again, a model file starts no program" in done.error  # joint values are no places
     (header, *rows), (_, *measured) = cells(Path("p.csv")), cells(Path("delta.csv"))

@@ -65,10 +65,7 @@ def program(arm: Case, tmp_path: Path) -> Path:
     """Commands around the measured ones, between columns that mean nothing here."""
     q = np.degrees(arm.train.q[:12].numpy()) + np.random.default_rng(0).uniform(-1, 1, (12, 6))
     joints = [dict(zip(arm.robot.joint_names, map(written, row), strict=True)) for row in q.round(6).tolist()]
-    write(
-        tmp_path / "program.csv",
-        [{"line": str(10 * k), **own, "note": f"a;b {k}"} for k, own in enumerate(joints)],
-    )
+    write(tmp_path / "program.csv", [{"line": str(10 * k), **own, "note": f"a;b {k}"} for k, own in enumerate(joints)])
     return tmp_path / "program.csv"
 
 

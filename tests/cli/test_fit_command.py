@@ -11,7 +11,6 @@ import torch
 from command_bank import STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, outlier_lines
 from diffeo_calib.calibration.result import parts
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -67,29 +66,6 @@ def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: 
         for part in parts(loaded)
     }
     assert {row[0]: row[1:] for row in rows if len(row) == 3} == sizes
-
-
-def test_fit_with_the_scales_of_another_robot(
-    model: dc.CalibratedKinematics, site: Site, command: Command, tmp_path: Path
-) -> None:
-    known, own = site.folder / "model.safetensors", tmp_path / "own.safetensors"
-    assert command(*site.fit(site.csv, own, "--scales-of", known)).code == 0
-    found = dc.load(own)
-    assert isinstance(found, dc.CalibratedKinematics)
-    assert found.scales is not None
-    assert model.scales is not None
-    ratios = (found.scales / model.scales)[model.scales > 0]
-    assert torch.unique(ratios.round(decimals=6)).numel() == 2  # length scales and factors; deviations
-    assert float(ratios.min()) == pytest.approx(1.0) or float(ratios.max()) == pytest.approx(1.0)
-
-
-def test_many_outliers_are_cut_short() -> None:
-    found = [Outlier(k, None if k % 2 else 1, k + 2, f"row {k + 2}", 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
-    first, *lines = outlier_lines([*found, found[0]], 100)
-    assert first.startswith("13 of 100 training rows look wrong")
-    assert lines[0] == "  row 2, marker 1: 50.000 mm off, weight 0.001; odd"
-    assert lines[1] == "  row 3: 49.000 mm off, weight 0.001; odd"  # a pose has no marker
-    assert (len(lines), lines[-1]) == (11, "  and 4 more")
 
 
 @pytest.mark.usefixtures("given_scales")

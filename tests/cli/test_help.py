@@ -6,7 +6,6 @@ What a terminal shows of names and cells, short and without control characters; 
 from __future__ import annotations
 
 import importlib
-import io
 import re
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command, Site, edited, environment, run_process, set_cell
-from rich.console import Console
 
 import diffeo_calib as dc
 from diffeo_calib.cli import console
@@ -85,22 +83,6 @@ def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, comm
     assert "--payload-mass is gone; write --payload." in command("fit", tmp_path / "c.toml").err
 
 
-def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:
-    """In words of the command line, though those of tables are of the class in Python."""
-    page = command("fit", "--help").out
-    found, text = entries(page), " ".join(page.split())
-    assert "required" not in found["--robot"] + found["--joints"]  # or --robot-pose
-    assert "[required]" in found["CSV"]
-    assert "default: 0.3" in found["--holdout"]
-    assert "0.0<=x<=0.9" in found["--holdout"]
-    assert "<m|mm|cm|inch>" in page
-    assert "Python" not in text.partition("Options:")[2]
-    assert text.count("needed where no model knows it") == 2
-    assert "all are in the plane of x and y. Repeatable." in text
-    assert "in the unit of --length." in text
-    assert "diffeo_calib.reports.results" in text
-
-
 SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors", "llvmlite")
 LIGHT = f"""
 import atexit, sys
@@ -112,9 +94,7 @@ main()
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [["--help"], ["-h"], ["--version"], ["fit", "--help"], ["demo", "-h"]],
-    ids=" ".join,
+    "arguments", [["--help"], ["-h"], ["--version"], ["fit", "--help"], ["demo", "-h"]], ids=" ".join
 )
 def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
     done = run_process(*arguments, program=("-c", LIGHT))
@@ -227,28 +207,6 @@ def test_names_and_cells_of_a_file_do_not_reach_the_terminal_as_they_are(
         assert "\x1b" not in done.err + done.out
         assert len(done.error) < 1500
         assert "elbow_joint" in done.error or words not in given[:2]
-
-
-def last_line(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, int, int]) -> str:
-    """The line on a terminal ten seconds after some calls, a second each."""
-    shown, now = io.StringIO(), [0.0]
-    monkeypatch.setattr(console, "err", Console(file=shown, force_terminal=True, width=120, color_system=None))
-    with console.progress_bar(clock=lambda: now[0]) as progress:
-        for call in calls:
-            progress(*call)
-            now[0] += 1.0
-        now[0] += 10.0
-    return [line for line in shown.getvalue().replace("\r", "\n").split("\n") if "0:00:" in line][-1]
-
-
-def test_progress_says_what_is_done_and_how_long_it_will_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A task without steps, and one that starts again, have no end."""
-    line = last_line(monkeypatch, ("registration", 0, 1), ("rows", 0, 400), ("rows", 100, 400), ("rows", 200, 400))
-    assert [word in line for word in ("rows", "registration", "0:00:13", "0:00:02")] == [True, False, True, True]
-    line = last_line(monkeypatch, ("rows", 400, 400), ("registration", 0, 1))
-    assert "finding base and markers" in line
-    assert "-:--:--" in line
-    assert "-:--:--" in last_line(monkeypatch, ("rows", 400, 400), ("rows", 0, 400))
 
 
 def test_keywords_are_said_as_options_unless_as_those_of_Python(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,6 @@ import shlex
 from dataclasses import replace
 from math import degrees, pi
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -102,33 +101,12 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     right = [f"right_{name}" for name in NAMES], q
     assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
     places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "right")]
-    both = (
-        ([f"left_{name}" for name in NAMES], q.roll(1, 0)),
-        (places[0], points.roll(1, 0)),
-        (places[1], points),
-    )
+    both = (([f"left_{name}" for name in NAMES], q.roll(1, 0)), (places[0], points.roll(1, 0)), (places[1], points))
     assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
 
 
 GON = 200.0 / pi
 GIVEN = ["--length", "mm", "--angle", "deg", "--position", "x,y,z"]
-
-
-def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(
-    tmp_path: Path, command: Command, frame: Any
-) -> None:
-    frame.to_csv(tmp_path / "t.csv", index=False)
-    name_space = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    (tmp_path / "arm.xacro").write_text(f'<robot name="a" {name_space}><xacro:arm prefix="left"/></robot>')
-    (tmp_path / "images").mkdir()
-    for table, robot, message in (
-        ("t.csv", "arm.xacro", "expand the xacro file first (`xacro FILE > robot.urdf`)"),
-        ("images", "arm.urdf", "is a folder: expected a table; of images of a board run `diffeo-calib images"),
-    ):
-        asked = command("init", tmp_path / table, tmp_path / robot, "-o", tmp_path / "c.toml")
-        words = [tmp_path / table, "--robot", tmp_path / robot, *GIVEN, "-o", tmp_path / "m.safetensors"]
-        assert asked.error == command("fit", *words).error
-        assert message in asked.error
 
 
 DH = [(0.07, -pi / 2, 0.41, 0.0), (0.5, 0.0, 0.0, -pi / 2), (0.04, -pi / 2, 0.0, 0.0)]
@@ -381,17 +359,6 @@ def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, com
     read = described(as_at_the_fit(shlex.join(words), Rows()))
     assert read == replace(table, position=positions, joints=NAMES)
     assert [words[words.index(name) + 1] for name in ("--base", "--tip")] == ["base_link", "flange"]
-
-
-def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, proposed: Proposed) -> None:
-    q, points = rows()
-    proposed((NAMES, q), (XYZ, points), (["x2", "y2", "z2"], points + 30.0))
-    lines = (tmp_path / "t.csv").read_text().splitlines()
-    lines[5] = ",".join([*lines[5].split(",")[:-2], "#VALUE!", "1"])
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    entries, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert entries["position"] == ["x,y,z"]
-    assert "line 6, column 'y2': expected a number, got '#VALUE!'" in text
 
 
 @pytest.mark.parametrize(

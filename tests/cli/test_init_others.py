@@ -17,8 +17,6 @@ import diffeo_calib as dc
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.cli.main import expanded
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 
@@ -165,18 +163,3 @@ def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command:
     refused = command("fit", tmp_path / "c.toml")
     assert refused.code == 1
     assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
-
-
-@pytest.mark.slow
-def test_a_kind_from_outside_alone(tmp_path: Path, init: Proposed) -> None:
-    """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
-    said = {}
-    for name in ("laser beams", "inclinations"):
-        kind = kind_named(name)
-        table = tmp_path / f"{name[:3]}.csv"
-        rows = kind.source.rows.parts[1].with_joint_names(kind.robot.joint_names)
-        write_measurements(table, rows, TableFormat("mm", "deg"))
-        said[name] = init(table, kind.urdf)
-    assert "line distance=line distance" in said["laser beams"][0]["reading"]
-    assert not said["inclinations"][0]
-    assert "measured poses" in said["inclinations"][1]

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import pytest
 from command_bank import Command
 from kind_bank import UNITS, Kind, kind_named, table_options
-from table_bank import held, says
+from table_bank import held
 from torch.testing import assert_close
 from two_arms_bank import HANDS, TwoArms
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.poses import points_of_frames
 
 pytestmark = pytest.mark.slow
 
@@ -42,19 +39,6 @@ def test_fit_says_where_frames_are_and_what_was_hidden(kind: Kind, command: Comm
     assert_close(places, TwoArms(kind.robot).frames[:, :3, 3], rtol=0, atol=2e-3)
 
 
-def test_predictions_are_read_back_without_errors(
-    kind: Kind, new: dc.Measurements, command: Command, tmp_path: Path
-) -> None:
-    kind.written(new, tmp_path / "new.csv")
-    done = command("predict", kind.file, tmp_path / "new.csv", *UNITS, "-o", tmp_path / "p.csv")
-    assert (done.code, done.err.strip()) == (0, "")
-    options = shlex.split(" ".join(done.out.split()).split("read these poses with ")[1])
-    again = command("evaluate", kind.file, tmp_path / "p.csv", *UNITS, *options)
-    assert again.code == 0
-    row = next(line for line in again.out.splitlines() if "20 in all" in line)
-    assert all(float(cell) == 0 for cell in row.split("│")[2:-2])  # the last one is the expected RMS
-
-
 def test_wrong_pose_of_one_hand_is_named(kind: Kind, new: dc.Measurements, command: Command, tmp_path: Path) -> None:
     poses = held(new.poses).clone()
     poses[7, 1, :3, 3] += 0.01
@@ -63,16 +47,3 @@ def test_wrong_pose_of_one_hand_is_named(kind: Kind, new: dc.Measurements, comma
     done = command("evaluate", kind.file, tmp_path / "wrong.csv", *UNITS, *table_options(form))
     assert "row 9, right: 17." in done.out
     assert "the frame on 'right' alone is off, the other poses of this row fit" in " ".join(done.out.split())
-
-
-def test_other_tips_and_other_kinds_are_refused(kind: Kind, new: dc.Measurements) -> None:
-    model = kind.model
-    with pytest.raises(MeasurementError, match=says("poses are on other tips", "['left', 'right']")):
-        dc.evaluate(model, new.with_tips(HANDS[::-1]))
-    with pytest.raises(InputError, match=says("do not have the same markers", "(20, 3, 3)")):
-        dc.evaluate(model, dc.Measurements.from_poses(new.q, held(new.poses)[:, 0]))
-    points = points_of_frames(held(new.frames), 0.1)
-    with pytest.raises(InputError, match="the model was calibrated with poses"):
-        dc.evaluate(model, dc.Measurements(new.q, points))
-    with pytest.raises(MeasurementError, match=says("has 2 tips", "from_poses(..., on=[...])")):
-        dc.calibrate(kind.robot, new.with_tips(None))

@@ -6,7 +6,6 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from command_bank import Command
@@ -54,15 +53,6 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
     assert "12 not used in the fit" in done.out
     assert done.out.count("known 50.000") == 3
     assert "expected absolute error" in done.out
-
-
-@pytest.mark.usefixtures("given_scales")
-def test_a_wrong_distance_is_warned_of(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(sockets)
-    options = *SOCKETS[:2], "--distance", "a,b=60", *SOCKETS[4:]
-    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "warned.safetensors")
-    assert done.code == 0
-    assert "the known distance of the sockets 'spot" in " ".join(done.err.split())
 
 
 WIRE = ["--reading", "distance=wire", "--session", "anchor"]
@@ -217,20 +207,3 @@ def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> 
         refused = command(*words)
         assert refused.code == 1
         assert "payload" in refused.error
-
-
-@pytest.mark.slow
-def test_masses(tmp_path: Path, command: Command) -> None:
-    """One that is a number holds for all rows; one below zero is refused."""
-    kind = kind_named("payloads")
-    table, options = kind.table("new")
-    done = command("predict", kind.file, table, *UNITS, "--payload", "4", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.err
-    written = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
-    places = torch.from_numpy(np.stack([written[axis] for axis in "xyz"], 1)) / 1e3
-    assert_close(places, kind.model.with_payload(4.0)(kind.new.q).detach()[:, 0], rtol=0, atol=1e-9)
-    header, *lines = [line.split(",") for line in table.read_text().splitlines()]
-    lines[1][header.index("payload")] = "-5"
-    (tmp_path / "t.csv").write_text("\n".join(map(",".join, [header, *lines])) + "\n")
-    done = command("evaluate", kind.file, tmp_path / "t.csv", *options)
-    assert "line 3, column 'payload': expected a mass of 0 or more, got '-5'" in done.error

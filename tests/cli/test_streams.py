@@ -18,8 +18,6 @@ from command_bank import TABLE, Command, Outcome, Site, environment, make_site
 from server_bank import Server
 
 import diffeo_calib as dc
-from diffeo_calib.cli.console import Interrupts
-from diffeo_calib.cli.record import record
 
 NOWHERE = {
     "a cut pipe": {1: "|"},
@@ -142,39 +140,6 @@ def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_pa
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
     assert err == "error: interrupted before there was a result to keep.\n"
-
-
-def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before, and the second time, the process ends."""
-    ended: list[str] = []
-    monkeypatch.setattr("diffeo_calib.cli.console.end_process", ended.append)
-    before = signal.getsignal(signal.SIGINT)
-    interrupts, seen, notes = Interrupts(), [], []
-    interrupts.install()
-    try:
-        progress = interrupts.watching(lambda *given: seen.append(given), notes.append)
-        progress("geometry", 0, 1)
-        signal.raise_signal(signal.SIGINT)
-        assert ended == ["interrupted before there was a result to keep"]
-        interrupts.install()
-        progress("hyper-parameters", 1, 40)
-        signal.raise_signal(signal.SIGINT)
-        assert len(ended) == 1
-        with pytest.raises(KeyboardInterrupt):
-            progress("hyper-parameters", 2, 40)
-        progress("Gauss-Newton", 0, 30)
-        signal.raise_signal(signal.SIGINT)
-        assert ended[1:] == ["interrupted again, stopped at once"]
-        Interrupts().install()
-        record.add(files={"program": "corrected.csv"})
-        signal.raise_signal(signal.SIGINT)
-        assert ended[2:] == ["interrupted; written: corrected.csv"]
-    finally:
-        signal.signal(signal.SIGINT, before)
-        record.add(files={})
-    assert interrupts.asked
-    assert notes[0].startswith("interrupted: finishing with the best state so far")
-    assert len(seen) == 4
 
 
 INTERRUPTIBLE = """

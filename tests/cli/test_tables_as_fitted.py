@@ -60,13 +60,6 @@ def test_options_that_are_none_are_one_error(words: str) -> None:
     assert as_at_the_fit(command, whole) == whole  # nothing of it is needed
 
 
-def test_a_separator_that_is_none_is_one_error(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("q1,x,y,z\n")
-    rows = as_at_the_fit("diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep 'ab'", Rows())
-    with pytest.raises(InputError, match="`sep`: expected one character"):
-        rows_in_table(tmp_path / "t.csv", rows)
-
-
 @pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])
 def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A device or a pipe would never end."""

@@ -14,14 +14,7 @@ from section_5 import section_5
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import diffeo_calib as dc
-from diffeo_calib.common.threads import (
-    LARGE_MATRIX,
-    allowed_threads,
-    in_parallel,
-    large_work,
-    small_work,
-    torch_alone,
-)
+from diffeo_calib.common.threads import LARGE_MATRIX, allowed_threads, in_parallel, large_work, small_work, torch_alone
 
 
 def counts() -> list[int]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from math import nan, pi
+from math import nan
 from typing import Any
 
 import pytest
 import torch
 from fit_bank import stop_at
 from math_bank import K_V, K_W, few_points, normal, rr_problem, two_marker_problem, uniform
-from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common import checks
@@ -167,26 +166,6 @@ def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
 def test_invalid_control_points_are_refused(controls: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         dc.fit(rr_problem(5), controls=controls)
-
-
-@pytest.mark.slow
-def test_a_coarse_fit_that_stops_before_the_optimum_says_how_to_continue() -> None:
-    """With large deformations and few control points Gauss-Newton's step is approximate; L-BFGS continues from it."""
-    x = pi * uniform(100, 3, seed=0)
-
-    def links(x: Tensor, lengths: tuple[float, float, float]) -> Tensor:
-        angles, scale = x.cumsum(1), torch.tensor(lengths, dtype=x.dtype)
-        return torch.stack([(scale * angles.cos()).sum(1), (scale * angles.sin()).sum(1)], 1)
-
-    y = links(x + 0.02 * x.sin() + 0.01 * (2 * x).cos(), (1.02, 0.69, 0.31)) + 0.01
-    kernels = {"joint_kernel": dc.VonMises((1.0,) * 3, variance=0.5), "task_kernel": dc.Gaussian(0.7)}
-    problem = Problem(lambda x: links(x, (1.0, 0.7, 0.3)), x, y, noise=1e-3, **kernels)  # pyright: ignore[reportArgumentType]
-    stopped = dc.fit(problem, integrator=dc.RK4(2), controls=x[::2])
-    assert not stopped.converged
-    assert "no step in the approximate Gauss-Newton direction" in stopped.status
-    assert "dc.LBFGS() from `start=fit.momenta`" in stopped.status
-    better = dc.fit(problem, dc.LBFGS(max_iterations=20), dc.RK4(2), controls=x[::2], start=stopped.momenta)
-    assert better.energy < 0.9 * stopped.energy
 
 
 def small_deformations(rows: int = 120) -> Problem:

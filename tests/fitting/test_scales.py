@@ -122,9 +122,6 @@ def test_what_is_not_chosen_stays_and_what_is_refused() -> None:
     refused(
         (r"`problem`: expected a dc.Problem, got Tensor", lambda: dc.choose_scales(X)),  # pyright: ignore[reportArgumentType]
         ("`iterations`", lambda: dc.choose_scales(arm(), iterations=0)),
-        (
-            "expected all data as control points, got 5 controls",
-            lambda: dc.choose_scales(arm().with_controls(X[:5])),
-        ),
+        ("expected all data as control points, got 5 controls", lambda: dc.choose_scales(arm().with_controls(X[:5]))),
         ("raise `noise`", lambda: dc.choose_scales(exact)),
     )

@@ -2,22 +2,11 @@
 
 from contextlib import suppress
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import torch
 from fit_bank import random_start, stop_at
-from math_bank import (
-    K_V,
-    K_W,
-    few_points,
-    normal,
-    planar_two_markers,
-    rr_problem,
-    tensor,
-    two_marker_problem,
-    uniform,
-)
+from math_bank import K_V, K_W, few_points, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -164,24 +153,6 @@ def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LB
 # --- L-BFGS --------------------------------------------------------------------------------------------------------
 
 
-def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupted during a line search, which overshoots at times: further evaluations never make it worse."""
-    energies = []
-    for calls in range(2, 8):  # the first evaluation is the start
-        problem = rr_problem(3)
-        run, stops = problem.deform, iter([False] * (calls - 1) + [True])
-
-        def deform(*given: Any, run: Any = run, stops: Any = stops) -> Any:
-            if next(stops, False):
-                raise KeyboardInterrupt
-            return run(*given)
-
-        monkeypatch.setattr(problem, "deform", deform)
-        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=random_start(problem)).energy)
-    assert energies == sorted(energies, reverse=True)
-    assert energies[-1] < energies[0]
-
-
 @pytest.mark.slow
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     problem = few_points()
@@ -225,19 +196,3 @@ def test_the_optimum_is_the_same_after_fewer_iterations(monkeypatch: pytest.Monk
     assert mixed.converged
     assert mixed.iterations < plain.iterations
     assert mixed.energy == pytest.approx(plain.energy, rel=1e-6)
-
-
-def test_a_mixed_point_that_is_no_better_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Then the plain step is taken, and mixing starts again."""
-    plain, asked = fitted(monkeypatch, 0.0), []
-
-    def far(self: Mixing, current: Momenta, target: Momenta) -> Momenta:
-        asked.append(1)
-        return current.towards(target, -0.5)
-
-    monkeypatch.setattr(Mixing, "mixed", far)
-    found = fitted(monkeypatch, 0.1)
-    assert asked
-    assert found.iterations == plain.iterations
-    assert found.history == plain.history
-    assert found.evaluations > plain.evaluations

@@ -2,17 +2,7 @@
 
 import pytest
 import torch
-from math_bank import (
-    CASES,
-    NAMES,
-    Case,
-    case_named,
-    central_difference,
-    naive_rk4,
-    normal,
-    rows_jacobian,
-    slopes,
-)
+from math_bank import CASES, NAMES, Case, case_named, central_difference, naive_rk4, normal, rows_jacobian, slopes
 from torch import Tensor
 
 import diffeo_calib as dc

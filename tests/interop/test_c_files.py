@@ -207,17 +207,6 @@ def test_joints_beyond_their_limits_come_back_and_the_rest_makes_up_for_them(arm
 
 
 @needs_compiler
-@pytest.mark.parametrize("bound", [-1.0, 0.0, 1e-4, 0.5])
-def test_no_step_is_longer_than_the_bound(arm: CModel, bound: float) -> None:
-    """Far targets, and targets out of reach."""
-    for seed in range(10):
-        target = twist_transform(draw(6, seed=seed, size=3.0)).numpy()
-        after, error = arm.newton_step(HOME, target, bound=bound)
-        assert np.linalg.norm(after - HOME) <= max(bound, 0.0) * (1 + 1e-12)
-        assert error > 0.1
-
-
-@needs_compiler
 @pytest.mark.parametrize("name", ["one joint", pytest.param("gantry", marks=pytest.mark.slow)])
 def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
     """They reach the poses that they can reach; another frame and prefix."""

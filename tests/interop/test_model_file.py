@@ -72,12 +72,6 @@ def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
             dc.load(path, nominal=other)
 
 
-def test_models_of_robots_are_loaded_without_a_function(sound: bytes, tmp_path: Path) -> None:
-    (tmp_path / "model").write_bytes(sound)
-    with pytest.raises(InputError, match="`nominal` was given, but the file holds its robot"):
-        dc.load(tmp_path / "model", nominal=elastic_rr.nominal)
-
-
 def test_every_kernel_comes_back(tmp_path: Path) -> None:
     mixed = dc.Space((True, False))
     kernels = (

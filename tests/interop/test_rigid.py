@@ -117,18 +117,6 @@ def test_on_a_real_robot(ur10_150: Case) -> None:
     assert rigid.validated[rigid.how] == pytest.approx(found, rel=0.15)
 
 
-@pytest.mark.slow
-def test_another_number_of_markers(arm: Case) -> None:
-    true, q = simulated(1)[0], arm.test.q[:20]
-    markers = torch.tensor([[0.05, 0.0, 0.1], [0.0, -0.06, 0.12]], dtype=torch.float64)
-    true.truth = replace(true.truth, tool=markers)
-    registered = arm.model.registered(dc.Measurements(q, true.true_points(q)))
-    found = rigid_kinematics(registered)
-    assert found.geometry.markers == 2
-    fitted = rigid_kinematics(arm.model)
-    assert found.rms < 2.0 * fitted.rms
-
-
 def read(path: Path) -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))

@@ -8,13 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from product_bank import Case
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
-from sklearn.model_selection import KFold, cross_val_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import check_estimator
 
 import diffeo_calib as dc
@@ -100,17 +96,6 @@ def with_scales(arm: Case) -> dc.interop.DiffeoRegressor:
     return dc.interop.DiffeoRegressor(arm.robot, hyperparameters=arm.result.selection.scales)
 
 
-@pytest.mark.slow
-def test_cross_validation_and_pipelines(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
-    folds, ours = KFold(2, shuffle=True, random_state=0), with_scales(arm)
-    scoring = "neg_root_mean_squared_error"
-    scores = cross_val_score(ours, *table, cv=folds, scoring=scoring)
-    assert scores.min() > -5e-3
-    degrees = make_pipeline(FunctionTransformer(np.deg2rad), ours)
-    degrees.fit(np.rad2deg(table[0]), table[1])
-    assert degrees.score(np.rad2deg(arm.test.q.numpy()), arm.test.points.flatten(1).numpy()) > 0.9999999
-
-
 def test_bad_arguments(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
     q, y = table
     make = dc.interop.DiffeoRegressor
@@ -128,21 +113,3 @@ def test_bad_arguments(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
     bad[3, 2] = np.nan
     with pytest.raises(ValueError, match="NaN"):
         make(arm.robot).fit(bad, y)
-
-
-def test_hidden_markers_and_poses(pair: Case, posed: Case) -> None:
-    """The same table as `calibrate` gets."""
-    data = pair.train[:20]
-    points = data.points.clone()
-    points[::4, 0] = torch.nan
-    found = dc.interop.DiffeoRegressor(pair.robot, hyperparameters=pair.result.selection.scales)
-    found.fit(data.q.numpy(), points.flatten(1).numpy())
-    data = dc.Measurements(data.q, points, pair.robot.joint_names)
-    model = dc.calibrate(pair.robot, data, hyperparameters=pair.result.selection.scales).model
-    q = pair.test.q[:5]
-    np.testing.assert_allclose(found.predict(q.numpy()), model(q).flatten(1), rtol=0, atol=1e-10)
-    lever, data = posed.model.lever, posed.train[:20]
-    found = dc.interop.DiffeoRegressor(posed.robot, lever=lever, hyperparameters=posed.result.selection.scales)
-    found.fit(data.q.numpy(), data.points.flatten(1).numpy())
-    assert found.model_.lever == lever
-    np.testing.assert_allclose(found.predict(q.numpy()), posed.model(q).flatten(1), rtol=0, atol=1e-3)

@@ -118,15 +118,6 @@ def test_refusals() -> None:
             TorchProgram(model, **arguments)
 
 
-def test_files_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot be written .*; make its folder first"):
-        export_torch(made("one joint"), tmp_path / "missing" / "program.pt2")
-    (tmp_path / "folder.pt2").mkdir()
-    with pytest.raises(InputError, match="cannot be written"):
-        export_torch(made("one joint"), tmp_path / "folder.pt2")
-    assert [path.name for path in tmp_path.iterdir()] == ["folder.pt2"]
-
-
 def test_onnx_needs_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxscript", None)
     with pytest.raises(InputError, match=r"a package that is not installed .*; pip install 'diffeo_calib\[onnx\]'"):

@@ -123,8 +123,3 @@ def test_without_a_home_nothing_is_written_into_the_current_folder(
     monkeypatch.setenv("XDG_CACHE_HOME", "relative too")
     passing("diffeo_calib")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
-    (tmp_path / "cache").write_text("", encoding="utf-8")
-    passing(tmp_path)

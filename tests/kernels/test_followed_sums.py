@@ -80,19 +80,6 @@ class Hidden(Profile):
 
 
 @torch_backends
-def test_a_parameter_of_a_profile_under_torch_func(backend: Backend) -> None:
-    def energy(alpha: Tensor) -> Tensor:
-        return (A * RadialKernel(Hidden(alpha)).using(backend).field(None, Q, A)).sum()
-
-    def expected(alpha: Tensor) -> Tensor:
-        return (A * ((-squared_distances(Q, Q) * alpha).exp() @ A)).sum()
-
-    alpha = torch.tensor([0.3, 0.8], dtype=torch.float64)
-    for transform in (torch.vmap, lambda f: torch.vmap(torch.func.grad(f))):
-        torch.testing.assert_close(transform(energy)(alpha), transform(expected)(alpha), rtol=1e-10, atol=1e-10)
-
-
-@torch_backends
 @pytest.mark.parametrize("points_too", [False, True])
 @pytest.mark.parametrize("accuracy", [None, 1e-3])
 def test_a_parameter_of_a_profile_has_a_gradient(backend: Backend, points_too: bool, accuracy: float | None) -> None:

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from functools import cache
 from pathlib import Path
@@ -156,18 +155,6 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
         sums._missing.cache_clear()
-
-
-def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The functions of a second one would end with it, and the process with them."""
-    monkeypatch.setattr(sums, "_machine", cache(lambda: time.sleep(0.05) or object()))
-    found: list[object] = []
-    threads = [threading.Thread(target=lambda: found.append(sums.machine())) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(one is sums.machine() for one in found)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")

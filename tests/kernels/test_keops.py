@@ -124,13 +124,6 @@ def test_import_is_late_and_silent_and_leaves_the_environment_alone(tmp_path: Pa
     assert in_a_process(LOAD, KEOPS_CACHE_FOLDER=str(tmp_path / "own"))[-1] == str(tmp_path / "own")
 
 
-def test_without_a_folder_that_can_be_made_there_is_one_for_the_process() -> None:
-    code = "import warnings\nwarnings.simplefilter('ignore')" + LOAD
-    folder = Path(in_a_process(code, XDG_CACHE_HOME="/dev/null")[-1])
-    assert folder.name.startswith("diffeo_calib-")
-    assert not folder.exists()
-
-
 FALL_BACK = """
 import json, sys, warnings
 import torch

@@ -124,14 +124,6 @@ def test_memory_is_bounded_by_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None
     assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
 
 
-def test_buffers_of_inference_mode_serve_outside_of_it() -> None:
-    i = points(COLUMNS, 1)
-    tiled.BUFFERS.of(7, i.features).clear()
-    with torch.inference_mode():
-        inside = Tiled(7).reduce(GRADIENT, GaussianProfile(), None, i)
-    assert_same(Tiled(7).reduce(GRADIENT, GaussianProfile(), None, i), list(inside), 0.0)
-
-
 # --- Differentiation --------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -156,10 +155,3 @@ def test_predictions_keep_the_index(arm: Case) -> None:
     assert list(found.index) == ["a", "b", "c"]
     np.testing.assert_allclose(found[["x", "y", "z"]], mean[:, 0])
     np.testing.assert_allclose(found[["std_x", "std_y", "std_z"]] ** 2, covariance[:, 0].diagonal(dim1=1, dim2=2))
-
-
-def test_without_pandas_there_is_one_sentence(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    for call in (arm.test.to_frame, dc.evaluate(arm.model, arm.test).to_frame, lambda: arm.model.to_frame(arm.test.q)):
-        with pytest.raises(ImportError, match=r"data frames need pandas: pip install .diffeo_calib\[notebooks\]"):
-            call()

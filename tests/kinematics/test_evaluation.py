@@ -148,12 +148,6 @@ def test_implausible_errors_have_a_sentence(arm: Case, posed: Case) -> None:
         dc.evaluate(arm.model, far)
 
 
-@pytest.mark.parametrize("function", [dc.rows_used_in_fit, dc.joints_outside_range])
-def test_ranges_belong_to_a_model(function: object) -> None:
-    with pytest.raises(InputError, match="`model`: expected a calibrated model of a robot, got int"):
-        function(3, [[0.0]])  # pyright: ignore[reportCallIssue]
-
-
 # --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------
 
 

@@ -248,17 +248,6 @@ def compiled_agrees(model: dc.CalibratedKinematics | FittedMap) -> None:
     same(slope, model.jacobian(q).flatten(1, -2).sum(1))
 
 
-class Wrapped(torch.nn.Module):
-    """A model as a module."""
-
-    def __init__(self, model: object) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor) -> Tensor:
-        return self.model(q)  # pyright: ignore[reportCallIssue]
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # torch's own
 def test_compiled_without_graph_breaks() -> None:
@@ -267,14 +256,3 @@ def test_compiled_without_graph_breaks() -> None:
     robot = made("mimic slides")
     q = queries(robot)
     same(torch.compile(robot, fullgraph=True, backend="eager")(q), robot(q), 1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_exported_for_any_number_of_rows() -> None:
-    """A robot with poses; a strict export is the capture of `torch.compile` and what this one does with it."""
-    model = made("one joint", markers=3)
-    q, rows = queries(model), ({0: torch.export.Dim("rows")},)
-    program = torch.export.export(Wrapped(model), (q,), dynamic_shapes=rows, strict=False).module()
-    for some in (q[:1], q, q.repeat(9, 1)):
-        same(program(some), model(some), 1e-12)

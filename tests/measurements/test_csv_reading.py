@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, held, in_order
@@ -19,8 +18,6 @@ from torch.testing import assert_close
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations
-from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
 quietly = pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")
@@ -148,18 +145,6 @@ def test_what_is_unmistakable_is_read_and_proposed(name: str, read: Reader, tmp_
     assert {*names} <= {*sheet.numbers} or "counted" in name
 
 
-def test_what_init_sees_in_odd_tables(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    path.write_text("".join(f"{k},{line}\n" for k, line in enumerate(BARE.splitlines())))
-    assert guess_sheet(path).numbers == ("2", "3", "4", "5", "6"), "a column that numbers the rows is no joint"
-    path.write_text(separated(";", [NAMES, *CELLS]).replace("1002.50", "1002,50"))
-    sheet = guess_sheet(path)
-    assert "x" not in sheet.numbers
-    assert "line 4, column 'x': expected a number, got '1002,50'; looks like a decimal comma" in sheet.odd
-    path.write_text("3,2,1\n1,2,3\n")
-    assert read_cells(path, ",") == ([*"123"], [(1, [*"321"]), (2, [*"123"])])
-
-
 MARKERS = {
     "names above the first of three": ",,M1,,,M 2,,\nq1,q2,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n",
     "names above each": (
@@ -177,17 +162,6 @@ def test_two_lines_of_names_are_joined(name: str, tmp_path: Path) -> None:
         data = read_measurements(path, JOINTS, triples, **FORMAT)
     assert_close(data.points[:, 0], data.points[:, 1], rtol=0, atol=0)
     assert {name for triple in triples for name in triple} <= {*guess_sheet(path).numbers}
-
-
-@pytest.mark.parametrize(
-    "content", [b"PK\x03\x04\0\0", PLAIN.replace("0.200,", "0.200,,").encode(), PLAIN.encode() + b'9,"']
-)
-def test_the_reason_of_the_reader_is_that_of_the_proposal(content: bytes, read: Reader, tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError) as reading:
-        read(content)
-    with pytest.raises(MeasurementError) as proposing:
-        guess_sheet(tmp_path / "table.csv")
-    assert str(proposing.value) == str(reading.value)
 
 
 def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
@@ -230,22 +204,6 @@ def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) 
     assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
     with pytest.raises(MeasurementError, match="`joints`"):
         read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS[:1], **how)  # pyright: ignore
-
-
-@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
-def test_units_of_length(unit: str, metres: float, read: Reader) -> None:
-    text = HEADER + f"0.5,{','.join(repr(value / metres) for value in (0.4, 1.0, 2.0, 3.0))}\n"
-    data = read(text, length=unit, kinds=["revolute", "prismatic"])
-    assert_close(data.points[0, 0], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
-    assert float(data.q[0, 1]) == pytest.approx(0.4)
-
-
-def test_duplicates_kept_or_dropped_on_request(read: Reader) -> None:
-    text = HEADER + ROWS + ROWS + "9,9,9,9,9\n"
-    assert len(read(text, duplicates="keep")) == 5  # asked for: no warning, and warnings are errors here
-    with pytest.warns(DiffeoCalibWarning, match=in_order("dropped 2 line(s) ... line 4, 5")) as record:
-        assert read(text, duplicates="drop").q[:, 0].tolist() == [0.1, 0.3, 9.0]
-    assert len(record) == 1
 
 
 SLIDE: dict[str, Any] = {"kinds": ["prismatic", "revolute"], "angle": "deg"}
@@ -417,16 +375,6 @@ def test_a_marker_near_the_origin_or_a_single_one_not_clearly_far_away_stays(rea
 
 
 # --- poses and deviations -------------------------------------------------------------------------------------------
-
-
-def test_poses_are_read(read: Reader) -> None:
-    text = HEADER.rstrip() + ",a,b,c\n1,2,1000,2000,3000,10,20,-170\n3,4,0,0,0,30,40,50\n"
-    data = read(text, length="mm", **POSED)
-    rotations = rotation_matrices(np.radians([[10, 20, -170], [30, 40, 50]]), "XYZ")
-    expected = transforms(rotations, torch.tensor([[1, 2, 3], [0, 0, 0]], dtype=torch.float64))
-    assert_close(held(data.poses), expected, rtol=0, atol=1e-15)
-    assert (data.lever, data.joint_names, data.std, data.rotation_std) == (0.1, ("q1", "q2"), None, None)
-    assert read(text, length="mm", lever=0.25, **POSED).lever == 0.25  # in m, whatever the file's unit
 
 
 @pytest.mark.parametrize(

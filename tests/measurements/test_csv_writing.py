@@ -322,17 +322,6 @@ def test_readings_name_their_columns_and_units(tmp_path: Path) -> None:
         read("distance", "d", length="m")
 
 
-def test_kinds_share_a_column_of_deviations_in_one_unit_alone(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("a,b,d,h,sd,who\n0,1,5,,0.1,A\n1,2,,7,0.2,B\n")
-    wire = ReadingColumns("distance", ("d",), "who", std=("sd",))
-    plane = replace(wire, kind="height", values=("h",))
-    data = read_observations(tmp_path / "t.csv", replace(SI, joints=NAMES, readings=(wire, plane)))
-    assert [held(part.std).tolist() for part in data.parts] == [[[0.1]], [[0.2]]]
-    angle = replace(plane, kind="angle", unit=("mrad", 1e3))
-    with pytest.raises(MeasurementError, match=r"distinct columns.*'sd'"):
-        read_observations(tmp_path / "t.csv", replace(SI, joints=NAMES, readings=(wire, angle)))
-
-
 def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:
     """As a program writes a table of numbers and names."""
     (tmp_path / "t.csv").write_text("a,b,x,y,z,s\n0,1,1,2,3,nan\n1,2,nan,nan,nan,p\n2,2,NaN,NaN,NaN,p\n")

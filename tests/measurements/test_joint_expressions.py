@@ -96,7 +96,7 @@ def test_commanded_poses_there_and_back(convention: str, length: str, angle: str
     path = tmp_path / "commanded.csv"
     path.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in cells.tolist()), ""]))
     columns, table = PoseColumns.of(f"{','.join(names)}={convention}"), TableFormat(length, angle)
-    assert_close(read_poses(path, replace(table, joints=columns)), commanded, rtol=0, atol=1e-12)
+    assert_close(read_poses(path, replace(table, joints=columns))[1], commanded, rtol=0, atol=1e-12)
     robot = dc.cartesian(commanded)
     table = replace(table, joints=replace(columns, robot=robot))
     q = read_joints(path, table)

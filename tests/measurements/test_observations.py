@@ -91,16 +91,6 @@ def test_copies_are_those_of_one_kind() -> None:
     assert Observations.joined([far, near, near.rows([3]), far.rows([0])]).copies() == [(8, 10), (0, 11)]
 
 
-def test_rows_in_sockets_beside_positions() -> None:
-    parts = tables()
-    both = dc.Measurements.joined([parts["position"], parts["socket"]])
-    assert both.rows([7, 0, 5, 1]).kinds == ("socket", "position", "socket", "position")
-    assert both.rows([7, 0, 5, 1]).places.tolist() == [1, -1, 0, -1]
-    some = parts["socket"].rows(slice(2))
-    again = dc.Measurements.joined([some, both, parts["socket"].rows([4])])
-    assert again.parts[0].device_names == [*some.device_names, *parts["socket"].device_names, "f/0"]
-
-
 def test_the_simplest_table_that_holds_the_rows() -> None:
     parts = tables()
     near = parts["distance"]
@@ -138,19 +128,6 @@ def test_payloads_names_lines_and_files(whole: Observations) -> None:
     assert Observations.joined(files[:2]).file_sha256 is None
 
 
-def test_as_text_html_and_data_frame(whole: Observations) -> None:
-    assert repr(whole).startswith("Observations(29 rows, 2 joints: Measurements(5 rows, 2 joints, 1 marker), ")
-    assert "Readings(5 distances of 2 devices)" in repr(whole)
-    assert "Readings(4 images of 1 device)" in whole._repr_html_()
-    assert "Readings(5 heights of 1 device)" in whole.parts[4]._repr_html_()
-    frame = whole.rows([20, 0, 25]).to_frame()
-    assert frame["kind"].tolist() == ["height", "position", "image"]
-    assert frame["height"].notna().tolist() == [True, False, False]
-    assert frame["session"].tolist()[::2] == ["top", "device"]
-    assert_close(float(frame["u"].iloc[2]), float(whole.parts[5].reported[0, 0]))
-    assert list(tables()["distance"].to_frame().columns) == ["a", "b", "distance", "std_distance", "session"]
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -170,12 +147,6 @@ def test_tables_that_cannot_be_joined(change: Callable[[Tables], list[dc.Measure
         Observations.joined(change(tables()))
 
 
-def test_a_calibration_does_not_ignore_names_of_joints(whole: Observations) -> None:
-    robot = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4), dc.DHRow(0.1, 0.2, 0.3, 0.4)])
-    with pytest.raises(dc.DiffeoCalibError, match="joint_1, joint_2"):
-        dc.calibrate(robot, whole)
-
-
 # --- readings -------------------------------------------------------------------------------------------------------
 
 
@@ -189,24 +160,6 @@ def test_deviations_of_readings() -> None:
     for std, said in ((0.0, "positive"), ([1.0, 2.0], "std"), (float("nan"), "std")):
         with pytest.raises(MeasurementError, match=said):
             Readings.heights(q, std=std)
-
-
-def test_readings_keep_the_devices_of_their_rows() -> None:
-    data = tables()["distance"]
-    assert [row.device_names for row in data] == [["A"], ["A"], ["B"], ["B"], ["A"]]
-    assert data[2:4].device.tolist() == [0, 0]
-    loaded = data.with_payload(2.0).with_tips(["left"]).with_line_numbers([9, 8, 7, 6, 5])
-    assert held(loaded[1:].payload).tolist() == [2.0] * 4
-    assert (loaded.ball_tip, loaded[[0]].line_numbers.tolist()) == ("left", [9])
-
-
-def test_readings_that_look_wrong_are_doubted() -> None:
-    q = values(3, 2)
-    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 4 rows repeat an earlier row exactly"):
-        Readings.heights(torch.cat([q, q[:1]]), 0.0)
-    with pytest.warns(dc.DiffeoCalibWarning, match="degrees"):
-        Readings.distances(100 * q, 1.0)
-    assert len(Readings.distances(100 * q, 1.0, doubt=False)) == 3
 
 
 def test_positions_beside_images_are_readings_with_their_deviations() -> None:

@@ -263,15 +263,6 @@ def test_nan_is_a_hidden_marker_and_follows_its_row() -> None:
     assert data.in_frames(turn.expand(12, 4, 4)).visible.tolist() == (~gone).tolist()
 
 
-def test_data_frames_show_what_is_hidden() -> None:
-    pytest.importorskip("pandas")
-    data = frames_on_tips()
-    found = data.to_frame()
-    assert_close(torch.from_numpy(found["right_y"].to_numpy(copy=True)), held(data.frames)[:, 1, 1, 3], equal_nan=True)
-    turns = torch.from_numpy(found[[f"head_r{axis}" for axis in "xyz"]].to_numpy(copy=True))
-    assert turns.isnan().all(1).tolist() == held(data.frames)[:, 2, 0, 0].isnan().tolist()
-
-
 # --- parts ----------------------------------------------------------------------------------------------------------
 
 

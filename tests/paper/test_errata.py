@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from eulerian_bank import CORRECTED, P0, deformed, momenta, small_problem
 from math_bank import rr_problem, uniform
-from matplotlib.image import imread
-from paper_figures import main
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -85,19 +82,3 @@ def test_erratum_3_the_energy_drifts_with_p_div_v_and_not_without(bed: dc.Proble
     assert corrected.energy_drift < 0.01
     assert printed.energy_drift > 10 * corrected.energy_drift
     assert printed.energy > corrected.energy
-
-
-# --- the paper's figures of any model ---------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("sys.argv", ["paper_figures.py", "--out", str(tmp_path)])
-    main()
-    printed = capsys.readouterr().out
-    assert "energy (16) 5.696" in printed
-    assert "5.07 orders of magnitude less" in printed
-    paths = sorted(tmp_path.iterdir())
-    assert [path.name.split("_")[1] for path in paths] == ["04", "06", "08", "10", "12"]
-    for path in paths:
-        assert min(imread(path).shape[:2]) >= 600

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from eulerian_bank import P0, deformed
-from fit_bank import stop_at
 from listings import Descent, Discretisation, evaluate, lr_calibration
 from math_bank import few_points, uniform
 
@@ -133,26 +132,3 @@ def test_too_long_a_step_diverges_and_says_so(formulation: str, step: float) -> 
     assert "lower `step`" in fit.status
     assert fit.iterations == len(fit.history) - 1
     assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
-
-
-def test_limit_and_interruption_keep_the_best_state() -> None:
-    fit = dc.fit(few_points(), dc.GradientDescent(step=STEP, max_iterations=3), dc.RK4(1))
-    assert "raise `max_iterations`" in fit.status
-    assert fit.solution.exhausted
-    assert fit.iterations == 3
-    assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
-    again = dc.fit(fit.problem, dc.GradientDescent(step=STEP, max_iterations=1), dc.RK4(1), start=fit.momenta)
-    assert again.history[0] == pytest.approx(fit.energy, rel=1e-12)
-
-    fit = dc.fit(few_points(), dc.GradientDescent(step=STEP), dc.RK4(1), progress=stop_at(2))
-    assert fit.solution.interrupted
-    assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"step": 0.0}, {"step": -1.0}, {"step": 1.0, "tolerance": -1.0}, {"step": 1.0, "max_iterations": 0}],
-)
-def test_wrong_settings(arguments: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=r"`(step|tolerance|max_iterations)`: expected"):
-        dc.GradientDescent(**arguments)  # pyright: ignore[reportArgumentType]

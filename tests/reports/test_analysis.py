@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from product_bank import Case, simulated, with_usual_scales
 from scipy.stats import chi2
 from table_bank import refused
@@ -21,9 +20,7 @@ from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictio
 from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
 from diffeo_calib.reports.html.sections import trust
 from diffeo_calib.reports.html.sentences import advice
-from diffeo_calib.reports.plots.panels import draw_before_after, draw_distributions
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.sensors.errors import Evaluation
 
 
 def of(fast: str, *slow: str) -> pytest.MarkDecorator:
@@ -231,21 +228,3 @@ def test_bands_of_transmission_errors_hold_the_truth(arm: Case) -> None:
         away = (error - error.mean()).abs() / rows.transmission_deviation(joint, values)
         inside.append(float((away < 1.96).double().mean()))
     assert 0.85 < np.mean(inside) <= 1.0, inside
-
-
-def test_errors_of_every_stage_are_drawn_also_those_of_zero() -> None:
-    """A logarithmic axis has no zero: they are drawn as tiny errors, without a warning."""
-    sizes = 1e-3 * torch.from_numpy(np.random.default_rng(0).exponential(size=(30, 2)))
-    stages = {"before": Evaluation(sizes), "half": Evaluation(0.5 * sizes), "none": Evaluation(0.0 * sizes)}
-    left, right = Figure().subplots(1, 2)
-    draw_distributions(left, stages)
-    draw_before_after(right, stages)
-    for line, own in zip(left.lines, stages.values(), strict=True):
-        expected = np.sort(1e3 * own.errors.flatten().clamp(min=1e-12).numpy())
-        np.testing.assert_allclose(line.get_xdata(), expected, rtol=1e-12)  # pyright: ignore
-        np.testing.assert_allclose(line.get_ydata(), 100 * np.arange(1, 61) / 60, rtol=1e-12)  # pyright: ignore
-    (scatter,) = right.collections
-    drawn = np.asarray(scatter.get_offsets())
-    np.testing.assert_allclose(drawn[:, 0], 0.5e3 * sizes.flatten().numpy(), rtol=1e-12)
-    assert drawn[:, 1].max() == drawn[:, 1].min() == 1e-9
-    assert right.get_title() == "better for 100 % of the measurements"

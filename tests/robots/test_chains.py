@@ -120,14 +120,6 @@ def test_joints_check_themselves(arguments: dict[str, Any], message: str) -> Non
         Joint("j", **{"kind": "revolute", "origin": EYE} | arguments)
 
 
-def test_joints_normalise_their_axis_and_copy_their_mimic() -> None:
-    drivers = {"k": 1.0}
-    joint = Joint("j", "revolute", EYE, torch.tensor([3.0, 0.0, 4.0]), mimic=drivers)
-    drivers["k"] = 2.0
-    assert joint.mimic == {"k": 1.0}
-    torch.testing.assert_close(joint.axis, torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("mimic", "message"),
     [
@@ -182,18 +174,3 @@ def test_a_driver_off_the_path_is_a_column(tmp_path: Path) -> None:
     slopes = torch.autograd.functional.jacobian(lambda row: upper(row[None])[0, :3, 3], q[0])
     torch.testing.assert_close(upper.jacobian(q[:1])[0, :3], slopes, rtol=0, atol=1e-14)
     assert robot_from_config(json.loads(json.dumps(upper.to_config()))).joint_names == upper.joint_names
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "ends", "message"),
-    [
-        ('"turn" multiplier="-0.5"', '"twist"', ("a", "hand"), "mimics 'twist', which is not a joint between 'a' and"),
-        ('<mimic joint="wrist"', "<mimic", ("floor", "finger"), "has no attribute 'joint'; add it"),
-    ],
-)
-def test_drivers_that_are_missing_are_explained(
-    old: str, new: str, ends: tuple[str, str], message: str, tmp_path: Path
-) -> None:
-    (tmp_path / "lift.urdf").write_text(LIFT.replace(old, new))
-    with pytest.raises(RobotError, match=message):
-        load_urdf(tmp_path / "lift.urdf", *ends)

@@ -1,10 +1,7 @@
 """Gravity sag and payloads: features against moments of weights, payloads of known mass."""
 
-from dataclasses import replace
-
 import pytest
 import torch
-from product_bank import usual_scales
 from robots_bank import CHAINS, draw, every_chain
 from simulated_body import URDF_FILE
 from torch import Tensor
@@ -40,20 +37,6 @@ def unexplained(features: Tensor, values: Tensor) -> float:
     """Largest residual of a linear fit."""
     solution = torch.linalg.lstsq(features, values[:, None], driver="gelsd").solution
     return float((features @ solution - values[:, None]).abs().max())
-
-
-# --- against physics ----------------------------------------------------------------------------------------------
-
-
-def test_centres_of_mass_beside_the_origins_are_nearly_explained() -> None:
-    """The features place masses at the frames' origins; centres of mass of real links lie a little beside them."""
-    arm = SimulatedArm(seed=3)
-    sag, q = GravitySag(arm.nominal), arm.sample(400)
-    features, torques = sag.features(q), arm.gravity_torques(q)
-    for joint, share in ((1, 0.02), (2, 0.04)):  # shoulder and elbow, which sag most
-        (compliance,) = (f for f in sag.compliances if f.own and f.joint == joint)
-        used = features[:, columns(sag, compliance)]
-        assert unexplained(used, torques[:, joint]) < share * float(torques[:, joint].abs().max())
 
 
 # --- the compliances of a chain --------------------------------------------------------------------------------------
@@ -150,24 +133,6 @@ def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
     for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
         sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
         assert set(sag.joints[sag.loaded].tolist()) == joints
-
-
-def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
-    chain = SimulatedArm(0).nominal
-    payload = Payload(chain.tips[0], MASSES, UNIT)
-    whole = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload)
-    assert whole.load.by_row
-    assert not whole.typical.load.by_row
-    q, theta = draw(len(MASSES), chain.n), 1e-3 * torch.ones(whole.parameters, dtype=torch.float64)
-    every = whole(q, theta)
-    some = torch.tensor([1, 3])
-    torch.testing.assert_close(whole.rows(some)(q[some], theta), every[some])
-    usual = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload.weighing(MASSES.median()))
-    torch.testing.assert_close(whole.typical(q, theta), usual(q, theta))
-    scales = usual_scales(chain)
-    one, three = (replace(scales, payload=factor).prior_variance(whole)[whole.sag] for factor in (1.0, 3.0))
-    torch.testing.assert_close(three, torch.where(whole.elasticity.loaded, 9.0, 1.0) * one)
-    assert list(GravitySag(chain, payload).parts)[-1] == "payload"
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from math import pi
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks
-from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import DHRow, SimulatedArm, from_dh, load_urdf
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
@@ -52,7 +49,6 @@ def two_arms() -> Tree:
 
 
 BODY = {name: load_urdf(URDF_FILE, *view) for name, view in VIEWS.items()}
-every_view = pytest.mark.parametrize("robot", BODY.values(), ids=BODY.keys())
 ROBOTS: dict[str, Tree] = {**CHAINS, "every mimic": CHAIN, "two arms": two_arms(), **BODY}
 every_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS.keys())
 
@@ -178,7 +174,7 @@ def laden(robot: Tree) -> GeometryMap:
 
 
 @every_robot
-@pytest.mark.parametrize("size", [0.0, 1e-9, 0.05, 0.5])
+@pytest.mark.parametrize("size", [1e-9, 0.5])
 def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: float) -> None:
     nominal = laden(robot)
     q, theta = draw(3, robot.n), draw(nominal.parameters, seed=14, size=size)
@@ -277,20 +273,3 @@ def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:
     for tip in (None, "middle"):
         with pytest.raises(RobotError, match=r"`tip`: expected one of left_hand, right_hand"):
             both.reversed(tip)
-
-
-@pytest.mark.slow
-def test_a_chain_seen_from_its_tool_is_calibrated(tmp_path: Path) -> None:
-    """A tracker on the flange of the simulated arm sees a marker on the floor."""
-    arm, q = SimulatedArm(seed=1, markers=3), SimulatedArm().sample(120, seed=1)
-    arm.truth = replace(arm.truth, tool=mark_points(torch.eye(4, dtype=torch.float64)[None], LEVER)[0])
-    marker = torch.tensor([0.3, 0.2, 0.1, 1.0], dtype=torch.float64)
-    seen = (torch.linalg.inv(poses_from_marks(arm.true_points(q), LEVER)) @ marker)[:, :3]
-    robot = arm.nominal.reversed()
-    data = dc.Measurements(reordered(q, arm.nominal, robot), seen + draw(120, 3, size=2e-5), robot.joint_names)
-    result, test = dc.calibrate(robot, data[:80]), data[80:]
-    assert dc.evaluate(result.model, test).rms < 0.3 * dc.evaluate(result.identification.geometry.points, test).rms
-    dc.save(result.model, tmp_path / "a.safetensors")
-    loaded = dc.load(tmp_path / "a.safetensors")
-    assert isinstance(loaded, dc.CalibratedKinematics)
-    assert_close(loaded(test.q), result.model(test.q), rtol=0, atol=0)

@@ -36,11 +36,7 @@ def in_this_process(command: Command) -> Callable[..., subprocess.CompletedProce
 @pytest.mark.usefixtures("undrawn", "given_scales")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run(
-    example: Path,
-    tmp_path: Path,
-    command: Command,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    example: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With at most 40 simulated rows, and 14 images; scales are given where the command line fits."""
     measure, sample, seen = SimulatedArm.measure, SimulatedArm.sample, simulated_camera.camera_arm

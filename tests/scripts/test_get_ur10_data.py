@@ -66,23 +66,6 @@ def test_writes_what_the_benchmark_reads(small: Path, tmp_path: Path, capsys: py
     assert (own / "dataset.json").read_text() == "{}"
 
 
-def test_failures_leave_nothing(
-    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """No network, a copy that is none or another file, a folder that cannot be made."""
-    folder, other = tmp_path / "data", tmp_path / "other" / get_ur10_data.FILE
-    other.parent.mkdir()
-    other.write_bytes(TABLE + b"1")
-    with monkeypatch.context() as patch:
-        patch.setattr(get_ur10_data, "URL", "http://127.0.0.1:1/nothing.csv")  # refused at once
-        patch.setenv("no_proxy", "127.0.0.1")
-        assert "pass --from FILE" in failure(capsys, folder)
-    assert get_ur10_data.SHA256 in failure(capsys, folder, "--from", other)
-    assert "neither a file nor a folder" in failure(capsys, folder, "--from", tmp_path)
-    assert not folder.exists()
-    assert "cannot be written" in failure(capsys, other, "--from", small)
-
-
 def test_the_published_file(ur10_folder: Path, tmp_path: Path) -> None:
     """The real table passes the check, and the robot of the descriptor is the URDF's robot."""
     get_ur10_data.main([str(tmp_path), "--from", str(ur10_folder.parent)])

@@ -18,9 +18,9 @@ therefore estimated before it, together with base and markers, as one constant p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -111,16 +111,12 @@ HALF_WEIGHT_MEDIANS = 2.0
 """Distance, in medians, at which a row has half its weight."""
 
 
-@dataclass(frozen=True, eq=False)
-class SocketRegistration:
+class SocketRegistration(NamedTuple):
     """Ball and sockets of a robot without errors."""
 
     geometry: Geometry  # with the ball as its marker; where the base is not known, it is the measuring frame
     positions: Tensor  # (S, 3) the sockets in the measuring frame, m
     distances: Tensor  # (N,) from the ball to its socket, m
-    # (3,) root mean square motion of the ball's place, per unit of its offset from the tip, by turns of the tool in the
-    # sockets, along three principal directions, largest first: 0 where the tool never turns
-    tilt: Tensor
 
 
 def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
@@ -145,9 +141,7 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
             break
-    places = R @ ball + t
-    tilt = torch.linalg.svdvals(A.flatten(0, 1)) / len(A) ** 0.5
-    return SocketRegistration(bare.with_tool(ball[None]), _means(places, socket, weights), distances, tilt)
+    return SocketRegistration(bare.with_tool(ball[None]), _means(R @ ball + t, socket, weights), distances)
 
 
 def socket_means(points: Tensor, socket: Tensor) -> Tensor:

@@ -18,13 +18,20 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import variation
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_identification,
+    check_readings,
+    check_socket_registration,
+    registered,
+    warn_of_wrong_sockets,
+)
 from diffeo_calib.calibration.identification.identification import (
     Identification,
     MeasuredPoints,
+    Prior,
     ReadRows,
     Rows,
     described,
@@ -33,19 +40,17 @@ from diffeo_calib.calibration.identification.identification import (
     identify,
     with_ball,
 )
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
-from diffeo_calib.calibration.placing.readings import ReadingDevices
-from diffeo_calib.calibration.placing.sessions import Drift, Sessions
-from diffeo_calib.calibration.placing.sockets import (
+from diffeo_calib.calibration.placing.readings import (
+    ReadingDevices,
     ball_of,
-    check_beside,
-    check_rows,
-    prior_of,
     reading_sets,
     register_ball,
-    warn_of_wrong_names,
+    resting_rows,
 )
+from diffeo_calib.calibration.placing.sessions import Drift, Sessions
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import few, sentence, warn_user
@@ -64,7 +69,6 @@ from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.tables import (
     Coordinates,
-    OtherReadings,
     ball_tip,
     check_poses,
     divided,
@@ -311,22 +315,29 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     """
     check_poses(data)
     coordinates, readings = divided(data)
-    check_rows(robot, [part.table for part in readings], alone=coordinates is None)
+    tables = [part.table for part in readings]
+    check_readings(robot, tables, alone=coordinates is None)
+    LOG.info("calibrating %s with %r", robot.name, data)
     if coordinates is None:
-        return _by_readings(robot, data, readings, progress)
-    return _by_coordinates(robot, data, coordinates, readings, progress)
-
-
-def _by_coordinates(
-    robot: Tree, data: Any, positions: Coordinates, readings: list[OtherReadings], progress: Progress
-) -> Placed:
-    """Rows that tell coordinates find the robot, around it devices of readings are found; then all rows together."""
-    positions.table.check_every_marker_seen()
-    sessions, table = Sessions.of_table(robot, positions, progress)
-    LOG.info("calibrating %s with %r", robot.name, table)
+        progress("geometry", 0, 1)
+        registration = register_ball(robot, tables)
+        rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
+        prior = None if resting_rows(tables) else Prior()  # readings alone do not tell it
+        fit = _fitted(rows, tables, registration, prior, adrift=True)
+        if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
+            each = zip(tables, registration.devices, free, strict=True)
+            parts = tuple(ReadRows(data, opened or stated) for data, stated, opened in each)
+            again = estimated(replace(rows, parts=parts), held_parameters(rows.geometry, adrift=True), prior)
+            for devices in again.devices:
+                devices.check_freed(fit.noise, again.noise)
+        return Placed(data, None, Placement(reading_sets(readings, fit.devices)), registration, fit)
+    coordinates.table.check_every_marker_seen()
+    sessions, table = Sessions.of_table(robot, coordinates, progress)
     progress("registration", 0, 1)
-    registration, tables = registered(robot, table), [part.table for part in readings]
-    check_beside(robot, table, registration, tables)
+    registration = registered(robot, table)
+    for resting in resting_rows(tables):
+        own = register_sockets(registration.geometry, resting.q, resting.device)
+        check_socket_registration(robot, resting, own, (registration.geometry, table))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     geometry, ball = registration.geometry, None
@@ -340,32 +351,20 @@ def _by_coordinates(
         registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    fit = estimated(rows, held_parameters(geometry))
-    warn_of_wrong_names(tables, fit.geometry)
-    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * fit.rms)
+    fit = _fitted(rows, tables, registration)
     model, count = fit.geometry, table.markers  # without a ball, which a device does not see
     check_identification(table, replace(fit, geometry=model.with_tool(model.tool[:count], model.on[:count])))
-    cameras = LensAndBoard.of_table(table, positions.rows, registration, sessions)
+    cameras = LensAndBoard.of_table(table, coordinates.rows, registration, sessions)
     placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices, "the measuring frame")))
-    return Placed(data, positions._replace(table=table), placement, registration, fit)
+    return Placed(data, coordinates._replace(table=table), placement, registration, fit)
 
 
-def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
-    """Ball, devices and geometric errors by readings alone."""
-    progress("geometry", 0, 1)
-    LOG.info("calibrating %s with %r", robot.name, data)
-    tables = [part.table for part in readings]
-    tip = () if tables[0].on is None else (tables[0].on,)
-    registration = register_ball(robot, tables, tip)
-    rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
-    held, prior = held_parameters(rows.geometry, adrift=True), prior_of(tables)
-    fit = estimated(rows, held, prior)
-    warn_of_wrong_names(tables, fit.geometry)
-    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * fit.rms)
-    if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
-        each = zip(tables, registration.devices, free, strict=True)
-        parts = tuple(ReadRows(data, opened or stated) for data, stated, opened in each)
-        again = estimated(replace(rows, parts=parts), held, prior)
-        for devices in again.devices:
-            devices.check_freed(fit.noise, again.noise)
-    return Placed(data, None, Placement(reading_sets(readings, fit.devices)), registration, fit)
+def _fitted(
+    rows: Rows, tables: Sequence[Any], start: Identification, prior: Prior | None = None, *, adrift: bool = False
+) -> Identification:
+    """The geometric calibration; tables of readings and their registration."""
+    fit = estimated(rows, held_parameters(rows.geometry, adrift=adrift), prior)
+    for resting in resting_rows(tables):
+        warn_of_wrong_sockets(resting, fit.geometry.points(resting.q)[:, -1])
+    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * start.rms, 1e3 * fit.rms)
+    return fit

@@ -1,7 +1,9 @@
-"""Ball, devices and geometric errors from readings, by maximum a posteriori with heavy tails.
+"""Ball, devices and sockets of readings: where they are, what rows say about them, and how a fit starts from them.
 
-Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error
-twist of the first joint are held, the devices are unknown.
+A ball in sockets is found in closed form, other devices around places of the ball on its tip that are tried. All are
+found again with the geometric errors, by maximum a posteriori with heavy tails. Without measured positions the robot's
+base is the measuring frame: base and error twist of the first joint are held, the devices are unknown. Known distances
+between sockets, linearised where these are, belong to what is known of their places before the rows.
 """
 
 from __future__ import annotations
@@ -9,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, nan
 from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot, pad
 
+from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.outliers import FAR
+from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, excluded
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,
@@ -27,34 +32,32 @@ from diffeo_calib.calibration.identification.identification import (
     described,
     solve,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.calibration.identification.registration import register_sockets, socket_means
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.cameras.images import projection
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.bodies import triple
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings, Sockets
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
+from diffeo_calib.sensors.coordinates import fitting_devices
+from diffeo_calib.sensors.devices import VALUE, Devices, Hypothesis, check_devices
+from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.set_ups import frame_slopes
+from diffeo_calib.sensors.tables import OtherReadings
+from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
 ROBOT_BASE = "the robot's base"
 """Measuring frame of rows without a device."""
-ROUGH_M = 2e-3
-"""Errors of a robot before its calibration, to compare starts."""
-STARTS_STEPS, COMPARED = 200, 1e-3  # most steps; change of the cost by which those end that are only compared
-BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
-"""Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
-UNEXPLAINED = "no place of ball and devices explains the readings"
-CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
-CHECK += "and which device each row names; or measure more rows with each device"
-LARGEST_SHARE, DOUBTED_SHARE, FAR_BETTER = 0.02, 0.002, 0.2
-"""Median residuals, relative to the robot's reach, that belong to a robot, and from which the other unit is tried; the
-part that the right unit leaves."""
-BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
-"""Of the ball on the tool by images of unknown cameras, m."""
-FEWEST_IMAGES = 8
-"""Rows of a camera from which a projection, 11 numbers, can be contradicted."""
+FEWEST_BESIDE = 2
+"""Rows of a socket besides one that are needed to judge it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +71,6 @@ class ReadingDevices(DeviceSet):
     devices: Devices
     data: Readings
     frame: str
-
-    @classmethod
-    def found(cls, devices: Devices, data: Readings, frame: str) -> ReadingDevices:
-        """Where a geometric calibration found them, with what is known of them before the fit."""
-        return cls(devices, data, frame)
 
     def reason(self, ball: Tensor, small: float) -> str:
         """Probable cause of a row whose readings are wrong: its ``ball`` (3,), ``small`` an error that fits, m."""
@@ -101,9 +99,14 @@ class ReadingDevices(DeviceSet):
             yield hypothesis._replace(effects=self._of_all_rows(hypothesis.effects, data))
 
     def settled(self, fit: Settled) -> ReadingDevices:
-        root, moved = self.devices.root, self.devices.shifted(fit.shifts)
+        moved = self.devices.shifted(fit.shifts)
+        root = self._compared(self.devices.root, moved, fit)
         std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt()
         return replace(self, devices=replace(moved, deviations=std.view_as(moved.deviations)))
+
+    def _compared(self, root: Tensor, moved: Devices, fit: Settled) -> Tensor:
+        """Those of the increments (D k, D k) that say where the devices are."""
+        return root
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         readings = next(part for part in other.readings if part.table.column_kind == self.data.column_kind)
@@ -127,6 +130,215 @@ class ReadingDevices(DeviceSet):
         values = {"constants": self.devices.constants, "deviations": self.devices.deviations}
         entries = {what: dict(zip(self.names, each.tolist(), strict=True)) for what, each in values.items()}
         return {"devices": entries}
+
+
+@dataclass(frozen=True, eq=False)
+class SocketDevices(ReadingDevices):
+    """The sockets of a calibration."""
+
+    devices: SocketPlaces
+    data: SocketReadings
+    # root mean square distance of the ball from the middle of its socket, every place predicted by all other rows, m
+    left_out_spread: float = nan
+
+    @property
+    def sockets(self) -> Sockets:
+        """Their names and known distances."""
+        return with_attributes(self.data, names=self.names).sockets
+
+    @property
+    def positions(self) -> Tensor:
+        """(S, 3) most probable places, m."""
+        return self.devices.constants
+
+    def reason(self, ball: Tensor, small: float) -> str:
+        return other_socket(ball, self.positions, self.names, small)
+
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        if not bool((self.rows == row).any()):
+            return super().elsewhere(row, points, devices)
+        away, nearest = torch.cdist(points[:, -1], self.positions.to(points)).min(1)
+        there = {"device": nearest, "names": self.names}
+        return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
+
+    def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
+        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
+        for block in self.sockets.blocks:
+            effects = data.points.new_zeros(*data.points.shape, 1)
+            for first, second, _ in block:
+                along = self.positions[second] - self.positions[first]
+                for number, sign in ((first, -0.5), (second, 0.5)):
+                    effects[self.rows[self.device == number], -3:, 0] = sign * along / along.norm()
+            first, second, length = block[0]
+            pair = [self.names[number] for number in (first, second)]
+            if len(block) > 1:  # at several places
+                pair = [name.rpartition(SEPARATOR)[2] for name in pair]
+            name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
+            yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
+
+    def settled(self, fit: Settled) -> SocketDevices:
+        settled: Any = super().settled(fit)
+        settled = replace(settled, devices=replace(settled.devices, before=()))
+        if fit.chosen is None:
+            return settled
+        away = socket_errors(self.left_out(fit.chosen), self.device, self.sockets)[0]
+        return replace(settled, left_out_spread=float(away.square().sum(1).mean().sqrt()))
+
+    def _compared(self, root: Tensor, moved: Devices, fit: Settled) -> Tensor:
+        if fit.fitted.workspace is None:
+            return root
+        B = frame_slopes(moved.constants[None], moved.constants.mean(0))[0]  # no device tells where all of them are
+        return root - B @ (torch.linalg.pinv(B) @ root)
+
+    def left_out(self, chosen: ChosenScales) -> Tensor:
+        """The ball (M, 3) as predicted without the rows of its place, m: with A their block of (G + R)^-1, by A^-1 mu.
+
+        What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
+        """
+        process, device = chosen.data.process(chosen.selection.scales), self.by_row(len(chosen.data.y))
+        numbers, shared = process.numbers, process.numbers.of_table(chosen.data.shared)
+        place = torch.where(device == NO_SOCKET, NO_SOCKET, self.sockets.place[device])[numbers.owner]
+        errors = process.left_out(place)[0]
+        for number in place[place >= 0].unique():
+            index = (place == number).nonzero()[:, 0]
+            others = process.mu - process.inverse[:, index] @ errors[index]  # K^-1 y without the place
+            errors[index] += shared[index] @ (shared.T @ others)
+        return self.positions[self.device] - numbers.in_table(errors)[self.rows, :3]
+
+    def warn_of_weakness(self, model: CalibratedKinematics) -> None:
+        """Nothing: sockets without a known distance are warned of at the start."""
+
+    def entry(self) -> dict[str, object]:
+        """Positions by name, and spread of places left out, for programs; in m."""
+        positions = dict(zip(self.names, self.positions.tolist(), strict=True))
+        return {"sockets": {"positions_m": positions, "left_out_spread_m": self.left_out_spread}}
+
+    def sentences(self) -> list[str]:
+        among = "among the sockets " * (self.frame == ROBOT_BASE)
+        each = zip(self.names, 1e3 * self.positions, 1e3 * self.devices.deviations, strict=True)
+        lines = [
+            f"socket '{name}': {triple(place)} mm in {self.frame}, deviations {among}{triple(deviation)} mm"
+            for name, place, deviation in each
+        ]
+        return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
+
+
+def other_socket(ball: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
+    """Why a ball (3,) is far from its socket: it may be in another one of places (S, 3), at most ``small`` m away."""
+    away = (ball - positions).norm(dim=1)
+    nearest = int(away.argmin())
+    if float(away[nearest]) > small:
+        return "far from where the other rows of its socket predict it"
+    return f"fits socket '{names[nearest]}': named after a wrong one?"
+
+
+SETS: Mapping[str, type[ReadingDevices]] = {KIND: SocketDevices}
+"""Sets of devices of readings but :class:`ReadingDevices`."""
+
+
+def reading_sets(
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str = ROBOT_BASE
+) -> tuple[ReadingDevices, ...]:
+    """Sets of devices with what is known of them before a fit around places where they were found.
+
+    Args:
+        readings: the rows that they measured. devices: of each of these. frame: that of the devices, in words.
+    """
+    sets = list[ReadingDevices]()
+    for (table, rows), old in zip(readings, devices, strict=True):
+        around = type(old).of(table, old.constants)
+        part = SETS.get(table.kind, ReadingDevices)(around, table, frame)
+        sets.append(part.measuring(rows, around.numbers(table)))
+    return tuple(sets)
+
+
+def contradicted_in_sockets(model: CalibratedKinematics, data: Any) -> list[Outlier]:
+    """Rows whose ball the model excludes from the middle of their socket, the worst first.
+
+    Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
+    wide prior that its rows share. The median distance says in which unit the model's deviations are to be taken: they
+    hold for errors elsewhere, and the rows of a socket share most of these.
+
+    Args:
+        model: of rows in sockets. data: rows of any kinds that took no part in its fit; those of other kinds are left
+            out.
+    """
+    outliers, fitted = list[Outlier](), model.map
+    for table in resting_rows(data.parts):
+        socket, predicted = table.device.to(table.q.device), fitted(table.q).detach()[:, -3:]
+        eye, rests = torch.eye(3, dtype=predicted.dtype, device=predicted.device), one_hot(socket).to(predicted)
+        at = fitted.geodesic.linearise(table.q).projected(pad(eye, (fitted.m - 3, 0)).expand(len(table), -1, -1))
+        K = fitted.conditional.covariance_between(at) + PLACES.found_m_rad**2 * torch.kron(rests @ rests.T, eye)
+        K = K + torch.block_diag(*fitted.new_noise[-3:, -3:].expand(len(table), -1, -1))
+        middles, inverse = socket_means(predicted, socket), torch.linalg.inv(K)
+        precisions, solved = own_blocks(inverse[None], len(table))[0], inverse @ (middles[socket] - predicted).flatten()
+        away = torch.linalg.solve(precisions, solved.view(-1, 3))
+        judged = (rests.sum(0)[socket] > FEWEST_BESIDE)[:, None]
+        squares = (away * solved.view(-1, 3)).sum(1, keepdim=True).masked_fill(~judged, torch.nan)
+        bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0) if bool(judged.any()) else judged
+        for row in bad.nonzero()[:, 0].tolist():
+            small = gates.REMAINING_ERROR * float((predicted[row] - middles[socket[row]]).norm())
+            reason = other_socket(predicted[row], middles, table.names, small)
+            line, name = int(table.line_numbers[row]), table.row_names[row]
+            outliers.append(Outlier(row, None, line, name, float(away[row].norm()), None, reason))
+    return sorted(outliers, key=lambda outlier: -outlier.distance)
+
+
+# --- where a fit starts -----------------------------------------------------------------------------------------------
+
+ROUGH_M = 2e-3
+"""Errors of a robot before its calibration, to compare starts."""
+STARTS_STEPS, COMPARED = 200, 1e-3  # most steps; change of the cost by which those end that are only compared
+BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
+"""Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
+UNEXPLAINED = "no place of ball and devices explains the readings"
+CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
+CHECK += "and which device each row names; or measure more rows with each device"
+LARGEST_SHARE, DOUBTED_SHARE, FAR_BETTER = 0.02, 0.002, 0.2
+"""Median residuals, relative to the robot's reach, that belong to a robot, and from which the other unit is tried; the
+part that the right unit leaves."""
+BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
+"""Of the ball on the tool by images of unknown cameras, m."""
+FEWEST_IMAGES = 8
+"""Rows of a camera from which a projection, 11 numbers, can be contradicted."""
+
+
+def resting_rows(tables: Sequence[Any]) -> list[SocketReadings]:
+    """The rows in sockets among tables of one kind each, at most one table."""
+    return [table for table in tables if table.kind == KIND]
+
+
+def register_ball(robot: Tree, tables: Sequence[Readings]) -> Identification:
+    """Ball and devices by readings alone, with errors of joints zero: in closed form where the ball rested in sockets.
+
+    Raises:
+        MeasurementError: rows that cannot belong to this robot, or that fit it far better in another unit.
+
+    Warns:
+        DiffeoCalibWarning: no known distance between sockets, rows that no places explain.
+    """
+    tip = tables[0].on
+    bare = Geometry.nominal(robot, 1, () if tip is None else (tip,))
+    for resting in resting_rows(tables):
+        if not resting.distances:
+            what = "no distance between sockets is known: the size of the robot rests on its description"
+            warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
+        start = register_sockets(bare, resting.q, resting.device)
+        check_socket_registration(robot, resting, start)
+        devices = [fitting_devices(table, start.geometry.points(table.q)) for table in tables]
+        return described(Rows(start.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
+    return register_readings(bare, tables)
+
+
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
+    """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
+    bare = geometry.with_tool(geometry.tool[-1:], (tip,))
+    for resting in resting_rows(readings):
+        return register_sockets(bare, resting.q, resting.device).geometry
+    for data in readings:
+        check_devices(data)
+    balls = [table for table in readings if kind_of(table).seen_points == 1]
+    return register_readings(bare, balls).geometry if balls else None
 
 
 def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identification:
@@ -242,13 +454,3 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
     moved = [device for part, some in each for device in part.devices(some)]
     return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
-
-
-def ball_of_readings(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
-    """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
-    for data in readings:
-        check_devices(data)
-    readings = [table for table in readings if kind_of(table).seen_points == 1]
-    if not readings:
-        return None
-    return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings).geometry

@@ -18,9 +18,8 @@ from torch.nn.functional import pad
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
-from diffeo_calib.calibration.placing.readings import ReadingDevices
+from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import reading_sets
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap

@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import ball_of
 from diffeo_calib.calibration.recalibration.drift import parts_of
 from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
@@ -41,7 +41,7 @@ from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_shown, mounted_of, sensor_of
+from diffeo_calib.sensors.coordinates import check_shown, mounted_of, sensor_of, with_earlier_cameras
 from diffeo_calib.sensors.tables import (
     ball_tip,
     check_markers,
@@ -63,7 +63,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         InputError: joints in another order, or markers that the model cannot be compared with.
         MeasurementError: too few rows, rows that show no error, or of another size than the robot's.
     """
-    new = new.to(HOST)
+    new = with_earlier_cameras(new.to(HOST), model)
     check_shown(new)
     coordinates, readings = divided(new)
     check_same_robot(model, new)

@@ -218,7 +218,8 @@ def _result(
     # a ball that a device measured is none in an unknown place any more
     measured = place.ball is None and marked is not None and not bool(marked.table.points[:, -1].isnan().all())
     ball = place.new_ball or (knows_ball(model) and not measured)
-    made = Provenance.now(new, note)
+    before_it = () if model.provenance is None else model.provenance.program_rows
+    made = replace(Provenance.now(new, note), program_rows=before_it)
     again = model.changed(map=fitted_map, provenance=made, placement=(), learnt=None, ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)

@@ -37,7 +37,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import mounted_of, sensor_of
+from diffeo_calib.sensors.coordinates import mounted_of, sensor_of, with_earlier_cameras
 from diffeo_calib.sensors.devices import Extrinsics
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.set_ups import frame_slopes
@@ -56,6 +56,7 @@ def registered(
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     if not issubclass(type(new), RowGroups):
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(new).__name__)
+    new = with_earlier_cameras(new, model)
     rows = measured_positions(new)
     check_same_robot(model, new)
     if rows is None:

@@ -11,9 +11,9 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.judged_rows import check_errors
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, outlier_lines
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, check_errors, contradicted, outlier_lines
+from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
@@ -22,7 +22,7 @@ from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, few
+from diffeo_calib.common.errors import PACKAGE, MeasurementError, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import positions_of
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
@@ -31,7 +31,6 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.report import write_report
-from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
@@ -51,13 +50,16 @@ def run(given: FitOptions) -> None:
         chain = robot_of(given, source)
         others = [load_kinematics(path) for path in given.scales_of or ()]
         data = source.read(chain, given.tip or chain.tips)
-        train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
+        try:
+            train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
+        except MeasurementError:
+            for positions in filter(None, divided(data)[:1]):
+                refuse_mistakes(chain, positions.table)  # in a wrong unit all rows are one configuration
+            raise
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
-        result = replace(result, model=made_by_command(result.model))
-    positions, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
-    on_tool = None if positions is None else positions.table.sees_board_from_tool(commanded=commanded)
-    hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
+        result = replace(result, model=made_by_command(result.model, source))
+    hand_eye = HandEye.of_fit(result.model)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
     each = {name: solved.entry() for name, solved in hand_eye.items()}

@@ -41,7 +41,6 @@ from diffeo_calib.measurements.poses import by_frame
 from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, flat_names
-from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 
 LOG = logging.getLogger(__name__)
@@ -197,19 +196,16 @@ def read_configurations(path: str | PathLike[str], table: TableFormat) -> dict[s
     return {"q": rows.q} | rows.beside
 
 
-def read_poses(path: Path, table: TableFormat) -> Tensor:
-    """The poses (N, 4, 4), or places (N, k), m, to which a machine was commanded, in the columns ``table.joints``."""
+def read_poses(path: Path, table: TableFormat) -> tuple[Tensor, Tensor]:
+    """The cells (N, c) of the columns ``table.joints``, and the commanded poses (N, 4, 4), or places (N, k), m."""
     columns: PoseColumns = table.joints
     plain = replace(table, joints=replace(columns, robot=None), angle="rad", joint_length=None, kinds=None)
     with quiet():  # numbers of rotations are read as angles
         cells = read_joints(path, plain)
     try:
-        poses = replace(columns, angle=table.angle).poses(cells)
+        return cells, replace(columns, angle=table.angle).poses(cells, table.joints_per_metre)
     except MeasurementError as error:
         raise MeasurementError(f"file '{path}': {error}") from None
-    if poses.ndim == 2:
-        return poses / table.joints_per_metre
-    return transforms(poses[:, :3, :3], poses[:, :3, 3] / table.joints_per_metre)
 
 
 # --- writing

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
-from math import pi
+from math import degrees, pi
 from pathlib import Path
 from runpy import run_path
 from typing import Any
@@ -36,6 +36,8 @@ from diffeo_calib.robots.tree import Chain
 FACTOR = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?|pi|\{[^{}]+\})"
 TERM = rf"{FACTOR}(?:\s*[*/]\s*{FACTOR})*"
 EXPRESSION = re.compile(rf"\s*[+-]?\s*{TERM}(?:\s*[+-]\s*{TERM})*\s*")
+COMPARED_ROWS, SAME_SHARE = 8, 1e-6
+"""Rows of a function's output that are compared, and how alike they are, as a share of the largest coordinate."""
 SIGNED_TERM = re.compile(rf"([+-]?)\s*({TERM})")
 WITH_OPERATOR = re.compile(rf"([*/]?)\s*({FACTOR})")
 
@@ -157,16 +159,38 @@ class PoseColumns:
         """(n,) boolean, which joints are columns as they are."""
         return torch.tensor([not self.convention] * len(self.texts), dtype=torch.bool, device=HOST)
 
-    def poses(self, cells: Tensor) -> Tensor:
-        """Cells (N, c) -> poses (N, 4, 4), or places (N, c), in the unit of the table."""
-        if not self.convention:
-            return cells
-        if self.is_program:
-            return _made(self.convention, cells)
+    def poses(self, cells: Tensor, per_metre: float = 1.0) -> Tensor:
+        """Cells (N, c) -> poses (N, 4, 4), or places (N, k), in the unit of the table, or with so many of it in m."""
+        made = _made(self.convention, cells) if self.is_program else cells
+        if made.ndim == 3:
+            return transforms(made[:, :3, :3], made[:, :3, 3] / per_metre)
+        if self.is_program or not self.convention:
+            return made / per_metre
         with of_measurements():
             place = "row {} of the commanded poses".format
             turns = rotation_matrices(cells[:, 3:], self.convention, angle=self.angle, place=place)
-        return transforms(turns, cells[:, :3])
+        return transforms(turns, cells[:, :3] / per_metre)
+
+    def program_rows(self, cells: Tensor, poses: Tensor) -> tuple[tuple[float, ...], ...]:
+        """Some of the cells (N, c) that a function took, and behind them what it made of them, m."""
+        rows = torch.cat([cells, _flat(poses)], 1)[:: -(-len(cells) // COMPARED_ROWS)]
+        return tuple(map(tuple, rows.tolist()))
+
+    def check_program(self, kept: Sequence[Sequence[float]], per_metre: float) -> None:
+        """Raise MeasurementError for another function than that whose :meth:`program_rows` a model keeps."""
+        rows = torch.tensor(kept, dtype=torch.float64, device=HOST)
+        cells, before = rows.tensor_split([len(self.columns)], 1)
+        now = _flat(self.poses(cells, per_metre))
+        if now.shape == before.shape and _alike(now, before):
+            return
+        got = f"one that makes {now.shape[1]} numbers of {len(self.columns)}"
+        if now.shape == before.shape:
+            away = (now - before).abs().amax(0)
+            got = f"one whose places differ by up to {1e3 * float(away[-3:].max()):.3g} mm"
+            got += "".join(f", directions by {degrees(float(turn)):.3g} degrees" for turn in away[:-3].sort()[0][-1:])
+        what, expected = f"--robot-pose {self.text}", "the function that the model was fitted with"
+        fix = "restore the file and the unit of what it returns (--length), or fit again"
+        raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
     def reread(self, table: Mapping[str, Tensor], per_metre: float) -> Iterator[tuple[Chain, Tensor, str]]:
         """Machine and joint values (N, n) of these columns in every other convention and unit, and its options.
@@ -211,10 +235,15 @@ def _made(program: str, cells: Tensor) -> Tensor:
     function: Callable[[Tensor], Any] | None = _names(path).get(name)
     if function is None:
         raise MeasurementError.of(f"the file '{path}'", expected=f"a function {name}", got="none of this name")
-    try:
-        output = torch.as_tensor(function(cells), dtype=cells.dtype, device=cells.device)
-    except (Exception, SystemExit) as error:
-        raise MeasurementError.of(f"{program} of {len(cells)} rows", got=f"{type(error).__name__}: {error}") from error
+
+    def made(rows: Tensor) -> Tensor:
+        try:
+            return torch.as_tensor(function(rows.clone()), dtype=cells.dtype, device=cells.device).detach()
+        except (Exception, SystemExit) as error:
+            got = f"{type(error).__name__}: {error}"
+            raise MeasurementError.of(f"{program} of {len(rows)} rows", got=got) from error
+
+    output = made(cells)
     places = output.ndim == 2 and 1 <= output.shape[1] <= 3
     if output.ndim == 0 or len(output) != len(cells) or not (places or output.shape[1:] == (4, 4)):
         expected = f"places ({len(cells)}, k) with k = 1, 2 or 3, or poses ({len(cells)}, 4, 4)"
@@ -224,7 +253,25 @@ def _made(program: str, cells: Tensor) -> Tensor:
         fix = "leave these rows out, or check the unit of their columns"
         what = f"what {program} returns of row {few(lost)}"
         raise MeasurementError.of(what, expected="finite numbers", got="NaN or infinity", fix=fix)
+    some = torch.arange(0, len(cells), max(2, -(-len(cells) // COMPARED_ROWS)), device=cells.device).flip(0)
+    again = made(cells[some])
+    if again.shape != output[some].shape or not _alike(_flat(again), _flat(output[some])):
+        got = "other numbers beside other rows, or each time"
+        fix = "a function treats every row by itself, and draws nothing"
+        raise MeasurementError.of(f"what {program} returns of a row", expected="always the same", got=got, fix=fix)
     return output
+
+
+def _flat(poses: Tensor) -> Tensor:
+    """Places (N, k) as they are; of poses (N, 4, 4) the axes of the frame, and behind them its place: (N, 12)."""
+    return poses if poses.ndim == 2 else poses[:, :3].mT.flatten(1)
+
+
+def _alike(now: Tensor, before: Tensor) -> bool:
+    """Whether rows of :func:`_flat` are the same but for rounding."""
+    size = torch.ones_like(before[0])
+    size[-3:] = before[:, -3:].abs().max()
+    return bool(((now - before).abs() <= SAME_SHARE * size).all())
 
 
 @cache
