@@ -187,7 +187,7 @@ def candidates(
         if places is not None:
             q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
         for name, criterion in criteria.items():
-            allowed = _allowed(name, criterion, q) if len(q) else torch.ones(0, dtype=torch.bool)
+            allowed = _allowed(name, criterion, q) if len(q) else torch.ones(0, dtype=torch.bool, device=HOST)
             refused[name], q = refused[name] + int((~allowed).sum()), q[allowed]
         drawn, accepted = drawn + together, accepted + len(q)
         batches.append(q)

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.planning.scene import Scene, followed, of_model, o
 from diffeo_calib.calibration.planning.sensors import Options, Sensor, sensors_for
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -275,7 +275,9 @@ def drawn(
         keep, tracker, cell: as of :func:`candidates`; the reflector of the tracker is one of the markers.
     """
     model = isinstance(given, CalibratedKinematics)
-    robot, base = (given.robot, given.geometry.base) if model else (given, torch.eye(4, dtype=torch.float64))
+    robot, base = (
+        (given.robot, given.geometry.base) if model else (given, torch.eye(4, dtype=torch.float64, device=HOST))
+    )
     reached = [sensor.reached(base) for sensor in sensors]
     groups = [(number, {}) for number in [reached.count({})] if number]
     groups += [(1, where) for where in reached if "keep" in where]

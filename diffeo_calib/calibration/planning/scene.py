@@ -170,7 +170,9 @@ def of_robot(
         frames: whether frames are measured, by default those of the tips.
         free: whether nothing will say where the robot stands: then its base is where the errors are judged.
     """
-    points, on, lever = _measured_points(robot, marker, torch.eye(4, dtype=torch.float64) if frames else MARKER)
+    points, on, lever = _measured_points(
+        robot, marker, torch.eye(4, dtype=torch.float64, device=HOST) if frames else MARKER
+    )
     geometry, residual, near = Geometry.nominal(robot).with_tool(points, on), USUAL_RESIDUAL, targets
     near = followed(targets, points.numel())
     if len(near) > 1:
