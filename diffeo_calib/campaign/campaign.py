@@ -83,13 +83,7 @@ class Campaign:
     """
 
     def __init__(
-        self,
-        robot: Tree,
-        *,
-        candidates: object = None,
-        target: object = None,
-        goal: float | None = None,
-        seed: int = 0,
+        self, robot: Tree, *, candidates: object = None, target: object = None, goal: float | None = None, seed: int = 0
     ) -> None:
         if not isinstance(robot, Tree):
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__)

@@ -70,14 +70,7 @@ class Around:
 
     @classmethod
     def of(
-        cls,
-        robot: Tree,
-        rows: Any,
-        asked: tuple[Tensor, Tensor],
-        same: Around | None,
-        *,
-        first: bool,
-        seed: int,
+        cls, robot: Tree, rows: Any, asked: tuple[Tensor, Tensor], same: Around | None, *, first: bool, seed: int
     ) -> Around:
         """Around accepted rows.
 

@@ -239,17 +239,6 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
     assert told(arm, q, points) is None
 
 
-@pytest.mark.slow
-def test_three_set_ups_are_no_drift() -> None:
-    arm = SimulatedArm(3)
-    q, points = arm.measure(90, seed=1)
-    steps = (torch.arange(90, dtype=torch.float64) // 30)[:, None, None]
-    rows = numbers(
-        r"moved more than once, near row (\d+) and row (\d+)", told(arm, q, points + steps * SHIFT, given=False)
-    )
-    assert rows == pytest.approx([30, 60], abs=3)
-
-
 def test_a_device_that_turns_and_comes_back_is_named() -> None:
     """0.1 mrad at 3 m for a quarter of the rows was silent, with true errors five times as large."""
     arm = SimulatedArm(1)

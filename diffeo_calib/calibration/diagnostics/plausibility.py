@@ -44,8 +44,7 @@ from diffeo_calib.common.errors import MOST_NAMES, InputError, MeasurementError,
 from diffeo_calib.common.quantiles import chi2_median, known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_unit
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import KIND, SocketReadings
+from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen
@@ -384,7 +383,7 @@ def check_socket_registration(
     fix += "of their own sockets: of the place and of the socket in it"
     said = {"what": what, "expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
     check_fit(robot, data, median, said, fix * far, groups=tried, judge=left)
-    for first, second, length in data.sockets.distances:
+    for first, second, length in data.lengths:
         apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (socket == first) | (socket == second)
         off = max(float(values.median()) for values in (fit.distances, fit.distances[there]))  # as bent links leave it

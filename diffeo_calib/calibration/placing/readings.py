@@ -40,9 +40,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import own_blocks
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, SEPARATOR, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings, Sockets
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -142,9 +141,9 @@ class SocketDevices(ReadingDevices):
     left_out_spread: float = nan
 
     @property
-    def sockets(self) -> Sockets:
+    def sockets(self) -> SocketReadings:
         """Their names and known distances."""
-        return with_attributes(self.data, names=self.names).sockets
+        return with_attributes(self.data, names=self.names)
 
     @property
     def positions(self) -> Tensor:
