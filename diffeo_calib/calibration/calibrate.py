@@ -26,8 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
-from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, warn_of_taken_scales, worth_it
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge
 from diffeo_calib.calibration.diagnostics.judged_rows import (
     common_cause,
     flagged,
