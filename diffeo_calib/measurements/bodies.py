@@ -1,8 +1,4 @@
-"""Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both.
-
-A body has an origin, the marker itself or that of its frame, and numbers that tell where it is: three coordinates, of
-frames a rotation vector too.
-"""
+"""Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both."""
 
 from __future__ import annotations
 
@@ -17,8 +13,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.rows import with_attributes
 
-BALL = "ball"
-"""Name of the last marker, if the other ones have names."""
+BALL = "ball"  # name of the last marker, if the other ones have names
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
 
 

@@ -1,9 +1,6 @@
 """Geometric identification: parameters, noise, tails and prior, on simulated truth and on hardware."""
 
-from __future__ import annotations
-
 from math import inf
-from typing import Any
 
 import pytest
 import torch
@@ -12,9 +9,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import Prior, identify, solve
+from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry, SimulatedArm
 
 ARM = SimulatedArm()
@@ -83,44 +79,6 @@ def test_deviations_of_translations_and_of_rotations_are_found_apart() -> None:
     prior = identify(start, q, start.points(q, theta) + draw(200, 2, 3, seed=3, size=1e-5)).prior
     assert prior.rotation == pytest.approx(1e-3, rel=0.5)
     assert prior.translation < 4e-4  # it is still falling when the noise has settled
-
-
-def test_left_out_points_are_predicted_by_the_others() -> None:
-    """In closed form as by leaving every row out."""
-    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=5e-5)
-    q, points = arm.measure(25)
-    start, squares = register(arm.nominal, q, points).geometry, []
-    found = identify(start, q, points)
-    for row in range(25):
-        others = torch.arange(25) != row
-        alone = identify(start, q[others], points[others], found.noise, found.prior).geometry
-        squares.append(float((alone.points(q[row : row + 1]) - points[row]).square().sum()))
-    assert found.left_out == pytest.approx((sum(squares) / 25) ** 0.5, rel=0.1)
-    assert found.left_out > 1.5 * found.rms
-
-
-class Ahead:
-    """One row with one unknown c, from c = 0.9 on nothing can be measured, such as behind a camera."""
-
-    freedom = (1,)
-
-    def errors(self, theta: Tensor, c: Tensor) -> list[Tensor]:
-        if float(c[0]) > 0.9:
-            raise InputError("behind the camera")
-        return [100 * (1 / (1 - c) - 2).view(1, 1, 1)]
-
-    def slopes(self, theta: Tensor, c: Tensor, root: Tensor) -> list[Tensor]:
-        return [100 / (1 - c).square().view(1, 1, 1, 1)]
-
-
-def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
-    """The first step of Gauss-Newton leads to c = 1."""
-    rows: Any = Ahead()
-    one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
-    found = solve(rows, one[0], none)
-    assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
-    with pytest.raises(InputError, match="behind"):
-        solve(rows, one[0], none, start=(one[0], one[0]))
 
 
 @pytest.mark.parametrize("axes", [3, 6])

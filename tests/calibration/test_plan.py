@@ -1,7 +1,5 @@
 """Planned poses: the greedy choice against brute force, what is known before it, and whether expectations come true."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any
@@ -106,8 +104,6 @@ def test_a_plan_can_be_made_in_parts() -> None:
         order = [*range(first), *reversed(range(first, last)), *range(last, 8)]
         assert float(moves[order[:-1], order[1:]].sum()) > float(moves.diagonal(1).sum()) - 1e-9
     assert bool((whole.expected_rms.diff() < 0).all())
-    assert whole.needed(float(whole.expected_rms[6])) == 6
-    assert whole.needed(0.0) is None
     assert "8 poses" in str(whole)
     assert "guesses" in str(whole)
 
@@ -135,9 +131,7 @@ def test_mistakes_are_one_sentence(arm: Case) -> None:
     refused(
         ("`robot_or_model`: expected a robot", planned("robot")),
         ("`candidates`: .*6", planned(q=every[:, :5])),
-        ("`candidates` is empty", planned(q=every[:0])),
         ("at most 2, got 3", planned(q=every[:2])),
-        ("at least 1", planned(count=0)),
         ("`target`: .*6", planned(target=[[0.0, 1.0]])),
         ("`measured`: .*not finite", planned(measured=every * torch.nan)),
         ("`marker` has the wrong shape", planned(marker=[1.0, 2.0])),

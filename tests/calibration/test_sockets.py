@@ -18,15 +18,17 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices, other_socket
+from diffeo_calib.calibration.placing.readings import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.sockets import SocketReadings
+from diffeo_calib.measurements.readings import SocketReadings
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
 DISTANCES = {("0", "1"): 0.05}
@@ -171,13 +173,6 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
             place(plain.nominal, table(some, **options), silent)
 
 
-def test_a_row_in_a_socket_says_why_it_is_far() -> None:
-    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-    seen = torch.tensor([[1.0, 1e-3, 0.0], [0.0, 0.4, 0.0]], dtype=torch.float64)
-    assert "'b/0'" in other_socket(seen[0], places, ("a/0", "b/0"), 0.01)
-    assert "its socket" in other_socket(seen[1], places, ("a/0", "b/0"), 0.01)
-
-
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
     names = list(some.names)
     names[3], names[20] = "2/1", "0/0"
@@ -194,6 +189,15 @@ def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: Sock
         place(plain.nominal, table(some, names), silent)
 
 
+def test_a_tool_that_never_turns(plain: SimulatedArm, some: SocketRows) -> None:
+    q = some.q[:1].repeat(12, 1)
+    q = q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    data = dc.Measurements.from_sockets(q, ["a"] * 12)
+    found = register_sockets(Geometry.nominal(plain.nominal), data.q, data.device)
+    with pytest.raises(MeasurementError, match="the tool hardly turns"):
+        check_socket_registration(plain.nominal, data, found)
+
+
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     wrong: Any = table
     named, pair = "expected 36 names, one per row, got", "expected names of two sockets"
@@ -207,7 +211,7 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
         ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
         ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
-        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={PAIR: 0.0})),
+        ("the distance of .* expected a positive number in m", lambda: wrong(some, distances={PAIR: 0.0})),
         (f"{pair}, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
@@ -217,8 +221,8 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
         table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
-    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
-    assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
+    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
+    assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]
 
 
 def test_splits_hold_out_whole_places(some: SocketRows) -> None:

@@ -1,15 +1,9 @@
-"""Two tables as one: joint values in one file, measured places in another, joined by a column that both have.
+"""Two tables as one, joined by a common column or time; stops of a robot in recordings with clocks of their own.
 
-The joined lines have the numbers of those of the places. Texts of the column are compared as they are. Numbers that
-mostly differ are times: the nearest belong together if they are within half a step. Of two recordings, whose clocks may
-differ, every stop becomes a line.
-
-Stops of a robot in two recordings that have clocks of their own: its joint values, and what a device saw.
-
-A recording stands still where no value changes by more than a tolerance within a window around it. The clocks differ by
-the shift with which both stand still and move at the same times most often. A stop lasts as long as both stand still,
-without half a window at either end; its row is the mean over it. Of images, whose motion nobody looks at, a stop of the
-joints takes the one nearest to its middle: clocks that differ by less than half a stop do no harm.
+Joined lines have the numbers of those of the places. Numbers that mostly differ are times: the nearest belong together
+if they are within half a step; of two recordings every stop becomes a line. The clocks differ by the shift with which
+both stand still, within a window around each time, and move at the same times most often. A stop is the mean while both
+stand still, without half a window at either end, or the image nearest to its middle.
 """
 
 from __future__ import annotations
@@ -31,12 +25,10 @@ from diffeo_calib.measurements.csv.cells import csv_text, find_columns, number
 from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
-MOVED = 1e-3
-"""Part of the range of a column by which it moves at least, unless its noise is larger."""
+MOVED = 1e-3  # part of the range of a column by which it moves at least, unless its noise is larger
 CLOCKS_AGREE = 0.1
 """Spread of the differences of two clocks at most, relative to the pauses between rows, and to how these differ."""
-Pairs = list[tuple[int, int]]
-"""Numbers of lines with the same joint values: of the joints and of the places."""
+Pairs = list[tuple[int, int]]  # numbers of lines with the same joint values: of the joints and of the places
 
 
 class HeldFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
@@ -119,9 +111,8 @@ def joined_file(
         if (rows := sorted({*range(len(file.keys))} - {pair[k] for pair in pairs}))
     ]
     if not pairs:
-        fix = "name a column with the same texts in both files, or with times of one clock"
-        expected, got = "values that both files have", " and ".join(without)
-        raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
+        fix, got = "name a column with the same texts in both files, or with times of one clock", " and ".join(without)
+        raise MeasurementError.of(f"--by {shown(by)}", expected="values that both files have", got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
     joined = HeldFile(places)
     joined.content = _written(tables, pairs, sep)
@@ -169,12 +160,10 @@ def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) ->
         if count > 1:
             table, other = tables[k], tables[1 - k]
             lines = [other.sheet.rows[pair[1 - k]][0] for pair in pairs if pair[k] == row]
-            fix = "remove the lines that do not belong there"
-            fix += "; if they are of several markers, name the column of these (--marker)" * (k == 0)
+            fix = "remove those that do not belong there, or name the column of markers (--marker)"
             what = f"file '{table.path}', line {table.sheet.rows[row][0]}, {table.by} {shown(table.keys[row])}"
-            raise MeasurementError.of(
-                what, expected="one partner", got=f"lines {few(lines)} of '{other.path}'", fix=fix
-            )
+            got = f"lines {few(lines)} of '{other.path}'"
+            raise MeasurementError.of(what, expected="one partner", got=got, fix=fix)
 
 
 def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
@@ -196,16 +185,11 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
 # --- stops
 
 Array = np.ndarray
-PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-"""Columns of a place and a rotation."""
-NOISE_FACTOR = 8.0
-"""Range of the noise within a window, in standard deviations, that is no motion."""
-STEP_S = 0.01
-"""Of the grid on which both recordings are compared."""
-SAME_TURN = 1e-9
-"""Range of a quaternion's numbers at all stops that is rounding."""
-FEWEST_CHANGES = 4
-"""Beginnings and ends of motions that tell how far the clocks differ."""
+PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")  # columns of a place and a rotation
+NOISE_FACTOR = 8.0  # range of the noise within a window, in standard deviations, that is no motion
+STEP_S = 0.01  # of the grid on which both recordings are compared
+SAME_TURN = 1e-9  # range of a quaternion's numbers at all stops that is rounding
+FEWEST_CHANGES = 4  # beginnings and ends of motions that tell how far the clocks differ
 
 
 @dataclass(frozen=True)
@@ -327,9 +311,11 @@ def pictured(
 def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
     """MeasurementError unless two recordings belong to the same time."""
     if times.max() + tolerance < joints.times[0] or times.min() - tolerance > joints.times[-1]:
-        expected = f"those of the joint states, {joints.times[0]:.3f} to {joints.times[-1]:.3f} s"
+        expected, fix = (
+            f"{joints.times[0]:.3f} to {joints.times[-1]:.3f} s, as of the joints",
+            "give the clocks' offset",
+        )
         got = f"{times.min():.3f} to {times.max():.3f} s"
-        fix = "let both use one clock, or give the offset"
         raise MeasurementError.of("the times of what was seen", expected=expected, got=got, fix=fix)
 
 
