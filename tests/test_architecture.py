@@ -3,8 +3,6 @@
 The story in four lines: mathematics without robots | robots and tables without kernels | where they meet | faces.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter
@@ -201,8 +199,6 @@ def test_few_public_names() -> None:
     assert len(set(names)) == len(names)
     assert [name for name in names if not hasattr(diffeo_calib, name)] == []
 
-
-# --- the checks above find what they are made for ---------------------------------------------------
 
 ARROWS = [
     ("kernels.radial", "kernels.spaces", True),

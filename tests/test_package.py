@@ -1,7 +1,5 @@
 """The package loads its public names when they are first used; a submodule never hides one of them."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import logging
@@ -132,8 +130,6 @@ def test_extras_in_messages_and_pages_exist() -> None:
     assert named <= set(re.findall(r"^(\w+) = ", table, re.MULTILINE))
 
 
-# --- every Python -----------------------------------------------------------------------------------------------------
-
 IMPORT_ALL = """
 import importlib, pkgutil, sys
 from importlib.abc import Loader, MetaPathFinder
@@ -181,9 +177,6 @@ def test_every_module_can_be_imported(version: str) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-# --- logging ----------------------------------------------------------------------------------------------------------
-
-
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.name.startswith("diffeo_calib.")]
 
@@ -206,9 +199,6 @@ def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFix
     assert found[places[-1]] == "rows that look wrong and hardly count: 7"
     assert f"model written to {tmp_path}/arm.safetensors" in found
     assert "judged by 20 rows it has not seen, 20 were used before" in found
-
-
-# --- notebooks --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["arm", "posed"])

@@ -65,9 +65,6 @@ def constant_kernel(variance: object = 1.0) -> RadialKernel:
     return RadialKernel(ConstantProfile(), variance=variance)
 
 
-# --- Textbook profiles ------------------------------------------------------------------------------------------
-
-
 def gaussian(r2: Tensor) -> Tensor:
     return torch.exp(-r2 / 2)
 
@@ -241,9 +238,6 @@ def case_named(name: str) -> Case:
     return next(case for case in CASES if case.name == name)
 
 
-# --- Naive algorithms -------------------------------------------------------------------------------------------
-
-
 def naive_rk4(field: Callable[[Tensor], Tensor], state: Tensor, steps: int) -> list[Tensor]:
     """States at the nodes of [0, 1]."""
     h, states = 1.0 / steps, [state]
@@ -278,8 +272,6 @@ def slopes(errors: list[float]) -> list[float]:
     """Orders of convergence when each entry halves the step of the one before."""
     return [log2(a / b) for a, b in pairwise(errors)]
 
-
-# --- Problems ---------------------------------------------------------------------------------------------------
 
 K_V, K_W = section_5_kernels()
 

@@ -23,8 +23,6 @@ from diffeo_calib.measurements.poses import rotation_numbers, to_spherical
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-# --- the robot and its links ---
-
 JOINT = (
     '<link name="{2}"/><joint name="{0}" type="{3}"><parent link="{1}"/><child link="{2}"/>'
     '<origin xyz="0 0 .06"/><axis xyz="0 1 0"/><limit lower="0" upper=".8"/>{4}</joint>'
@@ -137,9 +135,6 @@ def test_the_convention_that_explains_the_rows(
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
 
 
-# --- columns whose names leave something open ---
-
-
 def test_of_equal_series_the_robot_decides(proposed: Proposed, tmp_path: Path, command: Command) -> None:
     """Where it does not tell them apart the user is asked."""
     (q, points), other = rows(), [f"A{k}" for k in range(1, 7)]
@@ -227,8 +222,6 @@ def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -
     _, text = proposed((some, q[:, :5]), (XYZ, points))
     assert f"No column is named after {NAMES[3]}" in text
 
-
-# --- units, and what the columns of joints mean ---
 
 LIFT = """<robot name="lift"><link name="floor"/>
 <joint name="up" type="prismatic"><parent link="floor"/><child link="a"/><axis xyz="0 0 1"/>

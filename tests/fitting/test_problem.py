@@ -245,9 +245,6 @@ def test_controls_equal_to_the_data_are_the_problem_itself() -> None:
     assert problem.with_controls(problem.x[:7]).reduced
 
 
-# --- fits to functionals of k1 instead of its coordinates -----------------------------------------------------------
-
-
 ROWS = 30
 
 
