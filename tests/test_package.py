@@ -19,7 +19,7 @@ from product_bank import Case, simulated, with_usual_scales
 import diffeo_calib as dc
 
 PACKAGE = Path(dc.__file__).parent
-SLOW = (
+SLOW = [
     "torch",
     "numpy",
     "scipy",
@@ -31,7 +31,7 @@ SLOW = (
     "safetensors",
     "rich",
     "typer",
-)
+]
 """Libraries that a bare import does not load."""
 NAMES: list[str] = vars(dc)["__all__"]
 
@@ -61,14 +61,6 @@ def test_an_import_is_light_silent_and_hides_nothing() -> None:
     printed = ["", "False calibrate fit evaluate", "True True", "True", "0 ['NullHandler']"]
     assert (done.stdout.splitlines(), done.stderr) == (printed, "")
     assert set(dir(dc)) >= FOLDERS
-
-
-def test_every_public_name_is_loaded_and_listed() -> None:
-    assert set(NAMES) <= set(dir(dc))
-    assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))
-    for name in NAMES:
-        assert getattr(dc, name).__module__.startswith("diffeo_calib.")
-    assert len(set(NAMES)) == len(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +98,6 @@ def test_names_seen_by_type_checkers_are_those_that_are_loaded() -> None:
 def test_unknown_names_are_attribute_errors() -> None:
     with pytest.raises(AttributeError, match=r"^module 'diffeo_calib' has no attribute 'calibarte'$"):
         dc.calibarte  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(ImportError, match="cannot import name 'calibarte'"):
-        from diffeo_calib import calibarte  # noqa: F401  # pyright: ignore[reportAttributeAccessIssue]
     assert not hasattr(dc, "_calibrate")
 
 

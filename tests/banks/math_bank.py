@@ -1,7 +1,4 @@
-"""The problem bank of the mathematics: kernels with their textbook formulas, naive algorithms, and test problems.
-
-The second implementations use explicit pairs and plain autograd; they share only data types with the package.
-"""
+"""The problem bank of the mathematics: kernels with their textbook formulas, naive algorithms, and test problems."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

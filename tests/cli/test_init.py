@@ -75,14 +75,6 @@ def test_the_tip_is_what_carries_the_marker(tip: str, tmp_path: Path, proposed: 
     assert entries["tip"] == tip
 
 
-def test_links_without_usual_names_and_joints_that_follow(tmp_path: Path, proposed: Proposed) -> None:
-    """The tip is the link of the last joint, behind a wrist that follows the arm's own joints."""
-    follows = f'<mimic joint="{NAMES[1]}" multiplier="0"/>'
-    write_arm(tmp_path, ("level", "flange", "plate", "revolute", follows), ("screws", "plate", "probe", "fixed", ""))
-    q, points = rows()
-    assert proposed((NAMES, q), (XYZ, points))[0]["tip"] == "plate"
-
-
 def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, proposed: Proposed) -> None:
     """Numbered columns may be of either arm; named after its joints they are of one."""
     write_arm(tmp_path)

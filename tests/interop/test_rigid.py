@@ -1,7 +1,4 @@
-"""The best rigid kinematics of a model: exact where the model is rigid, and cross-validated.
-
-Correction tables and joint offsets: the joint comes to where it should, signs and ranges included.
-"""
+"""The best rigid kinematics of a model: exact where the model is rigid, and cross-validated."""
 
 import csv
 import math

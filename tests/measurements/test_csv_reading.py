@@ -83,13 +83,7 @@ READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "lists in cells": (_lists("[{}]", ", "), {"names": LISTED}, ""),
     "arrays of ROS in cells": (_lists("array('d', [{}])", ", "), {"names": LISTED}, ""),
     "lists of NumPy, with spaces": (_lists("[{} ]", "  "), {"names": LISTED}, ""),
-    "lists without quotes": (_lists("({})", ", ").replace('"', ""), {"names": LISTED}, ""),
     "trailing separators": (PLAIN.replace("\n", ",\n"), {}, ""),
-    "trailing separators of rows alone": (
-        PLAIN.replace("\n", ";\n").replace("z;", "z").replace(",", ";"),
-        SEMICOLONS,
-        "",
-    ),
     "decimal commas": (separated(";", [NAMES, *GERMAN]), COMMAS, ""),
     "thousands": (separated(";", [NAMES, *GROUPED]), SEMICOLONS, ""),
     "thousands in quotes": (PLAIN.replace("1000.50", '"1,000.50"'), {}, ""),
@@ -117,11 +111,6 @@ READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "another name twice": (separated(",", [[*NAMES, "t", "t"], *([*row, "1", "2"] for row in CELLS)]), {}, ""),
     "columns that are counted": ("0,1,2,3,4\n" + BARE, {"names": "01234"}, ""),
     "no names": (BARE, {"names": "12345"}, "no header line: columns are named by their places, 1 to 5"),
-    "no names, trailing separators": (
-        BARE.replace("\n", ",\n"),
-        {"names": "12345"},
-        "no header line: columns are named",
-    ),
 }
 
 

@@ -21,7 +21,6 @@ PARTS = {"position": ["p_x", "p_y", "p_z"]}
 STATED = "expected mm, as stated, got {} in the file; state the unit"
 FILES: list[Case] = [
     ("", {}, "is empty: expected a header"),
-    (",,\n,,\n", {}, "is empty"),
     (",,\n1,2,3\n", {}, "no column"),
     (HEADER, {}, "header but no rows: expected at least one row"),
     (TABLE + "1,2,3\n", {}, "line 4: expected 5 cells ... got 3"),
@@ -54,8 +53,6 @@ FILES: list[Case] = [
 OPTIONS: list[Case] = [
     (TABLE, {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
     (TABLE, {"angle": "degrees"}, "`angle`: expected 'rad' or 'deg', got 'degrees'"),
-    (TABLE, {"joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
-    (TABLE, {"decimal": ";"}, "`decimal` ... ';'"),
     (TABLE, {"decimal": ","}, "`sep` and `decimal`: expected different ... sep=';'"),
     (TABLE, {"sep": "::"}, "`sep`: expected one character, got '::'"),
     (TABLE, {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
@@ -88,9 +85,6 @@ POSES: list[Case] = [
     (POSE, {"rotation_angle": None}, "`rotation_angle` is missing ... expected 'rad' or 'deg'"),
     (POSE, {"rotation_angle": "grad"}, "`rotation_angle`: expected 'rad' or 'deg', got 'grad'"),
     (POSE, {"convention": "roll-pitch-yaw"}, "`convention` ... got 'roll-pitch-yaw'"),
-    (POSE, {"rotation": ["a", "b"]}, "`rotation`: expected 3 names of columns for 'XYZ', got ['a', 'b']"),
-    (POSE, {"rotation": [1, 2, 3]}, "`rotation` ... got [1, 2, 3]"),
-    (POSE, QUATERNION | {"rotation": ["a"]}, "`rotation`: expected 4 names of columns for 'quat_xyzw'"),
     (POSE, QUATERNION | {"rotation_angle": "deg"}, "`rotation_angle` beside convention 'quat_xyzw' ... leave it out"),
     (POSE, QUATERNION, "line 2, columns a, b, c, d: expected a quaternion of length 1 ... got 37.4299 ... order"),
     (POSE, QUATERNION | {"rotation_std": ["u", "v", "w"]}, "`rotation_angle` is missing"),

@@ -120,7 +120,6 @@ FAST = joint("k", "base_link", "upper_arm") + joint(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not well-formed XML"),
         ("<robot name='r'><link name='a'>", "is not well-formed XML (line 1"),
         ("<sdf/>", "is not a URDF: expected <robot> as its root element, got <sdf>"),
         ('<robot name="r" xmlns="x"><links/></robot>', "has no link 'base_link'"),
