@@ -69,15 +69,6 @@ def test_the_projection_is_a_minimum_and_its_numbers_are_those_of_the_geometry(a
         assert rms(found.geometry.points(q, theta), y) > found.rms
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["posed", "pair", "slider"])
-def test_poses_several_markers_and_slides(name: str, request: pytest.FixtureRequest) -> None:
-    model: dc.CalibratedKinematics = request.getfixturevalue(name).model
-    found = rigid_kinematics(model)
-    assert found.geometry.markers == model.markers
-    assert found.rms < with_errors(model, None).rms / 2
-
-
 @pytest.mark.parametrize("size", [1e-3, 0.2])
 def test_joint_offsets_are_found_again(size: float, arm: Case) -> None:
     """Those of the waist and of the last joint are the base's and the marker's: what they say together is the same."""

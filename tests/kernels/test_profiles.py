@@ -9,6 +9,14 @@ from diffeo_calib.kernels.profiles import MAX_ORDER, PROFILES, GaussianProfile
 
 
 @pytest.mark.parametrize("name", PROFILES)
+def test_every_derivative_is_the_slope_of_the_one_before(name: str) -> None:
+    profile, r2, h = PROFILES[name], tensor([0.03, 0.9, 2.3, 40.0]), 1e-5
+    for order in range(MAX_ORDER):
+        change = (profile.derivative(r2 + h, order) - profile.derivative(r2 - h, order)) / (2 * h)
+        torch.testing.assert_close(profile.derivatives(r2, order + 1)[order + 1], change, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PROFILES)
 def test_at_zero_values_are_one_and_all_is_finite(name: str) -> None:
     """And the slope is that of 1 - nu / (2 (nu - 1)) r2 + ..., of a Matern kernel."""
     profile, r2 = PROFILES[name], tensor([0.0, 1e-300, 1e-17, 1e-16]).requires_grad_()

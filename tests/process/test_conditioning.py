@@ -152,6 +152,20 @@ def test_errors_beside_unknowns_that_were_estimated_from_them(case: Case) -> Non
     close(Estimated(known, reference, A, [1, 4]).covariance_between(at), expected, 1e-9)
 
 
+def test_left_out_is_conditioning_without(case: Case) -> None:
+    """Rows, and groups of rows."""
+    rows = torch.arange(len(case.data.x))
+    for own in (rows[:1], rows[4:5], rows[1::4]):
+        kept, gone = case.part(rows[~torch.isin(rows, own)]), case.part(own)
+        known = kept.data.process(case.scales)
+        at = known.features(gone.numbers.at)
+        group = torch.isin(case.numbers.owner, own)
+        errors, covariance = case.posterior.left_out(group.to(torch.int64) - 1)
+        assert bool(errors[~group].isnan().all())
+        close(errors[group], gone.numbers.target - gone.numbers.there(known.mean(at)), 1e-6)
+        close(covariance[group][:, group], gone.numbers.with_noise(at.between(), gone.noise), 1e-6)
+
+
 @pytest.mark.parametrize("size", [2.0, None])
 def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | None) -> None:
     E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)

@@ -1,8 +1,8 @@
-"""Gravity sag under payloads of known mass; test_laws.py has the features against moments of weights."""
+"""Gravity sag and payloads: features against moments of weights, payloads of known mass."""
 
 import pytest
 import torch
-from robots_bank import CHAINS, draw
+from robots_bank import CHAINS, draw, every_chain
 from simulated_body import URDF_FILE
 from torch import Tensor
 
@@ -13,6 +13,43 @@ from diffeo_calib.robots import Chain, DHRow, Geometry, Joint, SimulatedArm, fro
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.runtime.chain import Compliance
+
+
+def origins(chain: Chain, q: Tensor) -> Tensor:
+    """Origins of all frames, the tip last: (N, n_all + 1, 3)."""
+    frames, tip = chain.joint_frames(q), chain(q)
+    return torch.cat([frames[..., :3, 3], tip[:, None, :3, 3]], dim=1)
+
+
+def columns(sag: GravitySag, compliance: Compliance) -> Tensor:
+    """(K,) True for the coefficients of one compliance."""
+    return torch.cat([torch.full((other.size,), other is compliance) for other in sag.compliances])
+
+
+def direction(chain: Chain, compliance: Compliance, q: Tensor) -> Tensor:
+    """The unit vector of a compliance in the base, (N, 3)."""
+    part = torch.from_numpy(compliance.axis)
+    return torch.einsum("nab,b->na", chain.joint_frames(q)[:, compliance.joint, :3, :3], part)
+
+
+def unexplained(features: Tensor, values: Tensor) -> float:
+    """Largest residual of a linear fit."""
+    solution = torch.linalg.lstsq(features, values[:, None], driver="gelsd").solution
+    return float((features @ solution - values[:, None]).abs().max())
+
+
+@every_chain
+def test_merged_places_lose_nothing(chain: Chain) -> None:
+    """The moment of a weight at any frame beyond a joint is in the span of the joint's features."""
+    sag, q = GravitySag(chain), draw(60, chain.n)
+    features, at = sag.features(q), origins(chain, q)
+    for compliance in sag.compliances:
+        e, used = direction(chain, compliance, q), features[:, columns(sag, compliance)]
+        for place in range(compliance.joint + 1, chain.moving + 1) if compliance.places else ():
+            arm = at[:, place] - at[:, compliance.joint]
+            moment = (e * torch.linalg.cross(arm, draw(3, seed=place).expand_as(arm))).sum(1)
+            assert unexplained(used, moment) < 1e-12
 
 
 def test_a_robot_without_lever_arms_has_no_sag() -> None:
