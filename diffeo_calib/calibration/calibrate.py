@@ -235,8 +235,6 @@ def _result(
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
     warn_of_outliers(outlying, placed.data)
     said = best and best.text
-    if best is None or not best.of_table:
-        said = placed.mislabelled(model, outlying) or said
     if placed.coordinates is not None:
         table, rows = placed.coordinates
         said = common_cause(model, table, flagged(len(data.x), outlying)[rows.to(HOST)], said)

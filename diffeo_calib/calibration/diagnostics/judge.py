@@ -71,7 +71,6 @@ class Finding(NamedTuple):
 
     text: str
     columns: Tensor | None  # (N, R, U) effects, m, of unknowns of unit variance that the model shall have
-    of_table: bool  # whether a column of the table is wrong, which explains wrong rows, too
 
 
 def judge(
@@ -119,7 +118,7 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns, best.columns is None)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------

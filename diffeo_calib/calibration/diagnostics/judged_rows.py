@@ -137,13 +137,12 @@ def outliers(
         outlying += [replace(outlier, row=int(rows[outlier.row])) for outlier in suspects]
     for kind in placed.readings:
         data, sizes = kind.data, each[kind.rows, 0].nan_to_num(0.0).norm(dim=1).tolist()
-        shown, balls = errors_of_kinds(left_out.errors, None, [kind]).main, model.at_payloads(data.payload)(data.q)
+        shown = errors_of_kinds(left_out.errors, None, [kind]).main
         unit, per_unit = shown.shown
         for k in bad[kind.rows, 0].nonzero()[:, 0].tolist():
             row, reading = int(kind.rows[k]), (per_unit * float(shown.errors[k, 0]), unit)
             of_row = row, None, int(data.line_numbers[k]), data.row_names[k], sizes[k], float(weights[row, 0])
-            reason = kind.reason(balls[k, -1].detach(), gates.REMAINING_ERROR * sizes[k])
-            outlying.append(Outlier(*of_row, reason, reading=reading))
+            outlying.append(Outlier(*of_row, FAR, reading=reading))
     return sorted(outlying, key=lambda outlier: -outlier.distance)
 
 

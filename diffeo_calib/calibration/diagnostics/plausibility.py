@@ -339,7 +339,7 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
 def check_socket_registration(
     robot: Tree, data: SocketReadings, fit: SocketRegistration, beside: tuple[Geometry, Measurements] | None = None
 ) -> None:
-    """Refuse rows that fit with one mistake undone, and known distances that are the robot's in another unit.
+    """Refuse rows that fit with one mistake undone, a tool that never turns, and distances in another unit.
 
     Warns:
         DiffeoCalibWarning: a ball in no socket, or not that of the robot that a device saw; a known distance that is
@@ -348,7 +348,11 @@ def check_socket_registration(
     Args:
         robot: n joints. data: the rows. fit: their registration. beside: the robot as a device saw it, and its rows.
     """
-    median, socket, around = float(fit.distances.median()), data.device, robot if beside is None else beside[0]
+    median, socket, around = (
+        float(fit.distances.median()),
+        data.device,
+        beside[0] if beside else Geometry.nominal(robot),
+    )
     far, usual = median > gates.SOCKET_FAR * robot.reach, inf
     if beside is not None and len(known(beside[1].points)) >= gates.OVERDETERMINED * (6 + 3 * beside[1].markers):
         usual = float(distances(*beside).nanmedian())  # fewer positions are fitted nearly exactly
@@ -369,6 +373,9 @@ def check_socket_registration(
     fix += "of their own sockets: of the place and of the socket in it"
     said = {"what": what, "expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
     likely_mistakes.check_fit(robot, data, median, said, fix * far, groups=tried, judge=left)
+    if fit.turning < gates.TURNED:
+        what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
+        raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
     for first, second, length in data.lengths:
         apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (socket == first) | (socket == second)
