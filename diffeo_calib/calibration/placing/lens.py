@@ -75,10 +75,11 @@ class BoardSize(DeviceSet):
     @classmethod
     def of_table(cls, data: Any, rows: Tensor) -> list[Any]:
         """Of a table of such poses, none for others; ``rows`` (M,) are its numbers in the whole table."""
-        if data.board is None or data.cameras:
+        origin, images = data.board, data.cameras
+        if origin is None or images:
             return []
-        shift = torch.cat([data.board, torch.zeros_like(data.board)], 1)[..., None]
-        larger = BoardPrior().scale * pose_jacobian(data.frames, data.lever, data.board)[:, 0] @ shift
+        shift = torch.cat([origin, torch.zeros_like(origin)], 1)[..., None]
+        larger = BoardPrior().scale * pose_jacobian(data.frames, data.lever, origin)[:, 0] @ shift
         return [cls(BoardCameras.of_rows(rows, torch.zeros_like(rows)), larger)]
 
     def effects(self, data: Seen) -> Tensor:
