@@ -4,8 +4,6 @@ Waiting for a second thread costs more than it brings on a busy machine; it is s
 and for the processes that tests start. Calibrations cost seconds, so files share them.
 """
 
-from __future__ import annotations
-
 import os
 import re
 
@@ -26,10 +24,10 @@ from product_bank import (
     Case,
     calibrated,
     calibrated_poses,
-    simulated,
     sliding_measurements,
     sliding_robot,
     ur10_measurements,
+    usual_scales,
     with_usual_scales,
 )
 from shared_bank import begin, shared
@@ -43,14 +41,6 @@ BANK = begin()  # of this run
 def arm() -> Case:
     """The simulated arm, calibrated with 60 poses of one marker."""
     return shared("arm", lambda: calibrated(60))
-
-
-@pytest.fixture(scope="session")
-def arm_200(arm: Case) -> Case:
-    """The simulated arm, calibrated with 200 poses and the scales of 60."""
-    robot, train, test = simulated(200)
-    given = {"hyperparameters": arm.result.selection.scales}
-    return shared("arm 200", lambda: Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, **given)))
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +60,8 @@ def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
     robot = sliding_robot()
     train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
-    return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train)))
+    scales = usual_scales(robot).inflated(2.0)
+    return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
 
 
 @pytest.fixture

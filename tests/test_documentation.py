@@ -1,7 +1,5 @@
 """Commands and snippets of README and site run, on files of the names that they use; links lead somewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Laws that errors of every kind of measurement obey, and crossings of kinds that are refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -89,9 +87,6 @@ def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
         assert_close(there, own @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
 
 
-# --- several devices of one kind ------------------------------------------------------------------------------------
-
-
 def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, Any, Any]:
     """Positions, and distances of devices with and without a known zero."""
     arm = SimulatedArm(0, markers=2)
@@ -130,9 +125,6 @@ def test_known_deviations_of_a_part_of_the_readings_of_a_device_are_refused() ->
         dc.Observations.joined([own, known])
 
 
-# --- crossings that are refused -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("verb", [dc.evaluate, dc.CalibratedKinematics.registered, dc.compare, dc.recalibrate])
 def test_a_payload_at_another_link_is_refused(verb: Callable[[Any, Any], Any]) -> None:
     kind = kind_named("payloads")
@@ -144,9 +136,6 @@ def test_a_payload_at_another_link_is_refused(verb: Callable[[Any, Any], Any]) -
 def test_set_ups_of_other_markers_than_those_of_the_model_are_refused() -> None:
     with pytest.raises(dc.DiffeoCalibError, match=r"same markers.*, 2, 3.*, 1, 3"):
         dc.evaluate(kind_named("positions").model, kind_named("sessions").new)
-
-
-# --- parts of tables ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("verb", [dc.compare, dc.recalibrate])
@@ -184,9 +173,6 @@ def test_a_recalibration_with_rows_of_one_set_up_knows_where_all_of_them_are(nam
         judged = dc.evaluate(found.model, rows.rows([name == one for name in rows.device_names]))
         assert judged.numbers == 0
         assert judged.rms < 3e-4
-
-
-# --- rows that tell nothing, and devices that the model knows ------------------------------------------------------
 
 
 def lone_rows(rows: Any) -> Any:
@@ -268,9 +254,6 @@ def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
     assert sum("away from that of the model" in line for line in partly.placed) == 1
     assert_close(partly.rows(known).errors, found.rows(known).errors, equal_nan=True)
     assert partly.rows(~known).rms < 1.2 * found.rows(~known).rms
-
-
-# --- rows that contradict all others --------------------------------------------------------------------------------
 
 
 def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:

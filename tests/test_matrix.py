@@ -4,8 +4,6 @@ A verb is a function below; it calls the verb for real, in Python or through the
 checks a small claim about what it gives.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -3,8 +3,6 @@
 And a package that only shrinks: its lines and those of each of its folders are held at the numbers of sizes.json.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import json
@@ -104,9 +102,6 @@ def test_names_say_what_they_hold() -> None:
     nodes = [node for tree in trees for node in ast.walk(tree) if type(node) in kinds]
     uses = Counter(getattr(node, kinds[type(node)]) for node in nodes)
     assert {word: uses[word] for word in VAGUE if uses[word] > MOST_USES} == {}
-
-
-# --- lines only fall ----------------------------------------------------------------------------------------------
 
 
 def lines_of_package() -> dict[str, int]:

@@ -1,7 +1,5 @@
 """Write the outputs that tutorials show anew: python tests/write_documentation.py [PAGE ...]."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

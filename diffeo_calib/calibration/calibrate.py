@@ -28,13 +28,14 @@ from diffeo_calib.calibration.choose_scales import (
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
-from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
-from diffeo_calib.calibration.diagnostics.outliers import (
+from diffeo_calib.calibration.diagnostics.judged_rows import (
+    common_cause,
+    flagged,
     outliers,
     warn_of_outliers,
     warn_of_stuck,
 )
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
@@ -45,7 +46,7 @@ from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult, parts
 from diffeo_calib.common.checks import check_count, check_seed
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
@@ -147,14 +148,13 @@ def calibrate(
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
-            lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
-            tell more; joint offsets are far from the robot's description; the median residual of a geometric
-            calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
-            although the robot moves; the rows show no errors of the robot; too few poses to
-            select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; rows that follow an axis do not tell its errors from a drift; a
-            length of robot or device is not what it is said to be; wrong rows follow one another; more than 40 % of the
-            rows are outliers; the joint values are rounded and this limits the accuracy.
+            lie in a plane or on a line, or move one joint at a time; joint offsets are far from the robot's
+            description; the median residual of a geometric calibration exceeds 5 % of the markers' spread and no other
+            reading explains it; a column holds one value although the robot moves; the rows show no errors of the
+            robot; too few poses to select scales; leave-one-out errors contradict the scales; during the measurements
+            something moved or drifted, a joint offset or a zero changed; rows that follow an axis do not tell its
+            errors from a drift; a length of robot or device is not what it is said to be; wrong rows follow one
+            another; more than 40 % of the rows are outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)
@@ -237,7 +237,11 @@ def _result(
     said = best and best.text
     if best is None or not best.of_table:
         said = placed.mislabelled(model, outlying) or said
-    warn_of_contradictions(model, placed.coordinates, outlying, said)
+    if placed.coordinates is not None:
+        table, rows = placed.coordinates
+        said = common_cause(model, table, flagged(len(data.x), outlying)[rows.to(HOST)], said)
+    if said:
+        warn_user(said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import Length
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import Placed

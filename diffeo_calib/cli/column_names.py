@@ -46,15 +46,13 @@ ROLES = {
 A machine has poses of its own, beside what was seen.
 """
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
-NAMED_UNITS = UNITS | {"kg": "kg", "grad": "deg"}
-"""Units as names of columns say them."""
+NAMED_UNITS = UNITS | {"kg": "kg", "grad": "deg"}  # units as names of columns say them
 SAID = WORDS["measured"] | WORDS["wished"] | WORDS["deviation"]
 GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "position", "trans", "tcp"} - {"q"}}
 GLUED |= {"d": "err", "e": "err", "s": "std"}
 """What stands before x, y or z in one word, and what it means."""
 SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_A-Za-z]+")
-LONGEST_LABEL = 6
-"""Words of a name that are compared with one label."""
+LONGEST_LABEL = 6  # words of a name that are compared with one label
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from diffeo_calib.cli.options import (
 )
 
 Frame = Literal["base", "measuring"]
-Free = Literal["both", "base", "marker"]
-"""Parts of the set-up that may have moved."""
+Free = Literal["both", "base", "marker"]  # parts of the set-up that may have moved
 CSV = "Table with a header, one configuration per row."
 NOTE = "Text to keep in the model file, such as a serial number."
 MODEL = "Model file written by `fit`."
@@ -143,10 +142,7 @@ class EvaluateOptions(Command, Rows):
         "found by their names.",
         "COLUMN",
     )
-    needs = (
-        ("--against", "--report"),
-        ("--position --socket --reading --length --angle --against", "CSV"),
-    )
+    needs = (("--against", "--report"), ("--position --socket --reading --length --angle --against", "CSV"))
     excludes = (("--tolerance", "--free"), ("--report", "--free -o"))
 
 
@@ -303,10 +299,7 @@ class ExportOptions(Command):
     payload: float | None = option(MASS, "MASS")
     length: Length = option("Unit of lengths in the CSV files written.", default="m")
     angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
-    needs = (
-        ("--tool --frame", "--c --torch --onnx"),
-        ("--tip", "--c --dh"),
-    )
+    needs = (("--tool --frame", "--c --torch --onnx"), ("--tip", "--c --dh"))
 
 
 class PlanOptions(Command, Candidates, Links, Units):

@@ -333,8 +333,7 @@ def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -
 
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-BELOW = (12, 13, 14)
-"""Places of the zeros below a rotation, of a matrix by rows."""
+BELOW = (12, 13, 14)  # places of the zeros below a rotation, of a matrix by rows
 
 
 class RowColumns(NamedTuple):
@@ -368,11 +367,10 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         readings = [*corners, *there]
     bodies = bodies or ([] if sockets or readings else _numbered(others))
     if not bodies and not sockets and not readings:
-        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
-        fix = f"if they are in another file: --places FILE --by {common}; "
-        fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
-        fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
+        fix = f"if they are in another file: --places FILE --by {common}; without a tracker: columns `place` and "
+        fix += "`socket` of a ball, or of a device, such as `distance`, `wire` or `height`; see `fit --help`, --reading"
+        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         got = "; ".join(left) or few(sheet.numbers, 20) or "no other columns"
         raise InputError.of(f"positions in '{sheet.path}'", expected=expected, got=got, fix=fix)
     options: dict[str, Any] = {"position": [body.written() for body in bodies] or None, "reading": readings or None}
@@ -457,8 +455,8 @@ def with_places(csv: Path, given: Places) -> tuple[Path, str]:
         pairs = [f"{key}={other}" for (key, names), (other, others) in each if sorted(names) == sorted({*others})]
         common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
     if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(part.header, 12) for part in (joints, places))
-        fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
-        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
+        got = " and ".join(few(part.header, 12) for part in (joints, places))
+        fix = "add the number of the pose, or name two: --by COLUMN=OTHER"
+        raise InputError.of("--places without --by", expected="a column of both files", got=got, fix=fix)
     by = given.by or max(common, key=lambda name: common[name])
     return joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True), by

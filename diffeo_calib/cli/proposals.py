@@ -51,20 +51,14 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import check_poses, measured_positions
 
-CLEAR_RATIO = 5.0
-"""A way is clear if every other one leaves more by this factor."""
-LARGEST_RESIDUAL = 0.1
-"""Median residual, as a share of the spread, above which no way is right."""
+CLEAR_RATIO = 5.0  # a way is clear if every other one leaves more by this factor
+LARGEST_RESIDUAL = 0.1  # median residual, as a share of the spread, above which no way is right
 DOUBTFUL = 0.01
 """Share of what the rows vary, left by the best units, above which other meanings of the joints are sought."""
-SMALLEST_PART = 0.1
-"""Of a joint's limits that a table passes through, in the right unit."""
-MOST_LENGTHS = 2
-"""Units of length, by the size of the robot, with which meanings of the joints are sought."""
-LARGEST_TURN_DEG = 3600.0
-"""Joint values beyond ten turns are no degrees."""
-SMALLEST_SPREAD_M = 1e-9
-"""Of points that never move."""
+SMALLEST_PART = 0.1  # of a joint's limits that a table passes through, in the right unit
+MOST_LENGTHS = 2  # units of length, by the size of the robot, with which meanings of the joints are sought
+LARGEST_TURN_DEG = 3600.0  # joint values beyond ten turns are no degrees
+SMALLEST_SPREAD_M = 1e-9  # of points that never move
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
 UNITS = "length", "angle", "joint_length", "camera_on_tool"

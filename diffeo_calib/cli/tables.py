@@ -235,9 +235,8 @@ class MeasuredTable:
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
         if count and self.table.session is None:
-            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
-            fix = "name the column of the set-ups (--session), or leave these rows out"
-            warn_user(sentence(f"{what}its frame", fix=fix))
+            what = f"{count} rows of the fit, of another set-up than the model's, are judged in the model's frame"
+            warn_user(sentence(what, fix="name the column of the set-ups (--session), or leave these rows out"))
 
 
 def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Tensor | None:
@@ -272,9 +271,8 @@ def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
         return replace(table, joints=replace(joints, robot=robot), kinds=robot.kinds)
     names, order = list(joints) or defaults, ",".join(defaults)
     if names != defaults and sorted(names) == sorted(defaults):
-        what = "--joints names the robot's joints in another order than the robot's"
         fix = "leave it out: columns that are named after the joints are found wherever they are"
-        raise InputError.of(what, expected=order, got=",".join(names), fix=fix)
+        raise InputError.of("--joints in another order", expected=order, got=",".join(names), fix=fix)
     if len(names) != robot.n:
         expected = f"{robot.n} columns, in the order {order.replace(',', ', ')}"
         raise InputError.of(f"--joints {','.join(names)}", expected=expected, got=len(names))

@@ -28,10 +28,8 @@ CHANNELS = {"mono8": [0], "8UC1": [0], "bgr8": [0, 1, 2], "8UC3": [0, 1, 2], "rg
 """Encodings of sensor_msgs/Image: where a pixel has its grey value, or blue, green and red."""
 SUFFIXES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"II*\0": ".tif", b"MM\0*": ".tif"}
 """First bytes of compressed images that `images` reads."""
-_Rows = list[list[float]]
-"""Times, s, each with values."""
-_Edge = tuple[str, str]
-"""Parent and child of a transform."""
+_Rows = list[list[float]]  # times, s, each with values
+_Edge = tuple[str, str]  # parent and child of a transform
 LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
 """The larger of these, s and median intervals, is the longest time between messages across which is interpolated."""
 
@@ -209,9 +207,8 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
     except DiffeoCalibError:
         raise
     except Exception as error:  # rosbags raises errors of many kinds for damaged files
-        expected = "the folder of a ROS 2 bag, with metadata.yaml, or a ROS 1 file"
-        fix = "give the file of a ROS 1 bag, with a name that ends in .bag, or convert it with rosbags-convert"
-        raise InputError.of(f"{bag} cannot be read", expected=expected, got=str(error), fix=fix) from error
+        fix = "pass the folder of a ROS 2 bag, with metadata.yaml, or the .bag file of ROS 1, or use rosbags-convert"
+        raise InputError.of(f"{bag} cannot be read", got=str(error), fix=fix) from error
 
 
 def _time(message: Any, topic: str) -> float:

@@ -17,8 +17,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.rows import with_attributes
 
-BALL = "ball"
-"""Name of the last marker, if the other ones have names."""
+BALL = "ball"  # name of the last marker, if the other ones have names
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
 
 

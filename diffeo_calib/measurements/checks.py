@@ -23,8 +23,7 @@ from diffeo_calib.common.data_frames import column_names, is_data_frame, named_c
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few
 
-LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
-"""Few axes turn further, so larger values are probably degrees."""
+LARGEST_JOINT_ANGLE_RAD = 4 * math.pi  # few axes turn further, so larger values are probably degrees
 USUAL_SIZES = {
     "angles": (LARGEST_JOINT_ANGLE_RAD, 2 * math.pi),
     "rotations": (2 * math.pi + 0.01, 2 * math.pi),
@@ -75,11 +74,9 @@ def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_k
     if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]
+    slide = "" if small or kinds_known else ", or pass the robot, which knows its prismatic joints"
     text = f"{what} reach {'only ' * small}{largest:g} {unit}: they look like {words}"
-    if not small and not kinds_known:
-        slide = "or like millimetres of a prismatic joint; pass the robot, which knows its prismatic joints"
-        return [f"{text}, {slide}, or {option}='{other}' if they are {words}."]
-    return [f"{text}; pass {option}='{other}' if they are."]
+    return [f"{text}; pass {option}='{other}' if they are{slide}."]
 
 
 def numbered(names: object, rows: int, what: str = "the names of sessions") -> tuple[Tensor, tuple[str, ...]]:
@@ -89,24 +86,21 @@ def numbered(names: object, rows: int, what: str = "the names of sessions") -> t
     """
     try:
         names = names.tolist() if isinstance(names, Tensor) else names
-    except RuntimeError as error:  # of a sparse or quantized tensor, or one on the meta device
-        got = "a tensor that cannot be listed"
-        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got) from error
-    given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
+        given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
+    except (RuntimeError, TypeError):  # of a tensor that is sparse, quantized, on the meta device or without axes
+        given = []
     if len(given) != rows:
         raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given) or as_written(names))
     empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
     texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
-    unnamed = [row for row, text in enumerate(texts) if not text]
-    if unnamed:
+    if unnamed := [row for row, text in enumerate(texts) if not text]:
         text = f"{what}: {len(unnamed)} row(s) have no name, the first is row {unnamed[0]}"
         raise MeasurementError.of(text, fix="name every row")
     distinct = tuple(dict.fromkeys(texts))
     return numbers_of(texts, distinct), distinct
 
 
-LARGEST_SI = 1e9
-"""Larger joint values or positions, rad or m, are no measurements."""
+LARGEST_SI = 1e9  # larger joint values or positions, rad or m, are no measurements
 
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
@@ -126,11 +120,9 @@ def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[s
 
 def check_size(values: Tensor, name: str) -> None:
     """Raise MeasurementError for values in SI units that are no measurements: marks of missing readings, or damage."""
-    bad = (values.abs() >= LARGEST_SI).nonzero()
-    if len(bad):
-        where = [int(i) for i in bad[0]]
-        what = f"`{name}` has {len(bad)} value(s) that cannot be measured, the first at index {where}"
-        expected, got = f"less than {LARGEST_SI:g} m or rad", f"{float(values[tuple(where)]):g}"
+    if len(bad := (values.abs() >= LARGEST_SI).nonzero()):
+        what = f"`{name}` has {len(bad)} value(s) that cannot be measured, the first at index {bad[0].tolist()}"
+        expected, got = f"less than {LARGEST_SI:g} m or rad", f"{float(values[tuple(bad[0])]):g}"
         raise MeasurementError.of(what, expected=expected, got=got, fix="remove or repair these rows")
 
 
@@ -148,21 +140,20 @@ def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, byte
 
 def chosen_rows(index: object, count: int) -> Tensor:
     """Row numbers (M,) that an index chooses of ``count`` rows; see :meth:`RowGroups.rows`."""
-    rows = np.arange(count)
+    rows, what = np.arange(count), "the selection of rows"
     try:
-        index = index.numpy(force=True) if isinstance(index, Tensor) else index
-        key = index if isinstance(index, slice) else np.asarray(index)
+        key = index.numpy(force=True) if isinstance(index, Tensor) else index
+        key = key if isinstance(key, slice) else np.asarray(key)
         if not isinstance(key, slice) and key.dtype.kind not in "iub" and key.size:
             raise TypeError(f"{key.dtype} values")
         chosen = np.atleast_1d(rows[key] if isinstance(key, slice) or key.size else rows[:0])
     except (TypeError, ValueError, RuntimeError) as error:
         expected, got = "an integer, a slice, integers or a boolean mask", f"{type(index).__name__} ({error})"
-        raise MeasurementError.of("the selection of rows", expected=expected, got=got) from None
+        raise MeasurementError.of(what, expected=expected, got=got) from None
     if chosen.ndim != 1:
-        raise MeasurementError.of("the selection of rows", expected="one axis", got=f"{chosen.ndim} axes")
+        raise MeasurementError.of(what, expected="one axis", got=f"{chosen.ndim} axes")
     if len(chosen) == 0:
-        fix = "choose other rows"
-        raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
+        raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix="choose other rows")
     return torch.as_tensor(chosen, dtype=torch.int64, device=HOST)
 
 
@@ -187,10 +178,8 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
         if value.ndim >= 2 and value.shape == like.shape[: value.ndim]:
             value = value.masked_fill(empty if value.ndim == like.ndim else empty.flatten(value.ndim).all(-1), 1.0)
     given = copied(value, name, *shapes, fix=fix).to(like.device)
-    bad = (given <= 0).nonzero()
-    if len(bad):
-        where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
-        what = f"`{name}`" + f", first at index {where}" * bool(where)
+    if len(bad := (given <= 0).nonzero()):
+        what, got = f"`{name}`" + f", first at index {bad[0].tolist()}" * bool(given.ndim), float(given[tuple(bad[0])])
         raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
     spread = given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape)
     return spread.masked_fill(empty, torch.nan)
@@ -230,15 +219,11 @@ def checked_names(
         names = (names,) if isinstance(names, str) else tuple(names)
     except (TypeError, RuntimeError):
         names = ()
-    fix = f"pass one per {each}"
-    if not all(isinstance(name, str) for name in names):
-        got = few([type(name).__name__ for name in names])
-        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=fix)
-    if len(names) != count:
-        raise MeasurementError.of(f"`{what}`", expected=f"{count} names", got=f"{len(names)} ({names})", fix=fix)
-    if distinct and len(set(names)) < len(names):
-        fix = "rename the repeated ones"
-        raise MeasurementError.of(f"`{what}`", expected="distinct names", got=list(names), fix=fix)
+    texts, repeats = all(isinstance(name, str) for name in names), distinct and len({*names}) < len(names)
+    expected = f"{count} names" if texts and not repeats else "distinct names" if texts else "texts"
+    if len(names) != count or not texts or repeats:
+        got = f"{len(names)} ({few([*map(str, names)])})"
+        raise MeasurementError.of(f"`{what}`", expected=expected, got=got, fix=f"pass one per {each}")
     return names
 
 
@@ -260,15 +245,12 @@ def marker_places(points: object) -> Tensor:
     places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
     if not bool(empty.any()):
         return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
-    half = (empty.any(2) & ~empty.all(2)).nonzero()
-    if len(half):
+    if len(half := (empty.any(2) & ~empty.all(2)).nonzero()):
         row, marker = half[0].tolist()
-        got = ", ".join(axis for axis, missing in zip("xyz", empty[row, marker].tolist(), strict=True) if missing)
         what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
         expected = "three finite numbers, or NaN for all three of a hidden marker"
-        raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
-    rows = empty.all(2).all(1).nonzero()[:, 0].tolist()
-    if rows:
+        raise MeasurementError.of(what, expected=expected, got=raw[row, marker].tolist(), fix="repair these rows")
+    if rows := empty.all(2).all(1).nonzero()[:, 0].tolist():
         what = f"`points`, row {few(rows)}: no marker was seen"
         raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
     return places.masked_fill(empty, torch.nan)
@@ -281,10 +263,9 @@ def rare_names(names: Sequence[str], lines: Sequence[int], fewest: int) -> list[
     """
     counts, texts = Counter(name for name in names if name), []
     digits = {name: "".join(filter(str.isdigit, name)) for name in counts}
-    for name, count in counts.items():
-        if count < fewest:
-            numbers = [line for line, other in zip(lines, names, strict=True) if other == name]
-            usual = [other for other, rows in counts.items() if rows >= fewest and digits[other] == digits[name]]
-            meant = "".join(f", perhaps meant as '{other}'" for other in get_close_matches(name, usual, n=1))
-            texts.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(numbers)}){meant}")
+    for name in (name for name in counts if counts[name] < fewest):
+        numbers = [line for line, other in zip(lines, names, strict=True) if other == name]
+        usual = [other for other, rows in counts.items() if rows >= fewest and digits[other] == digits[name]]
+        meant = "".join(f", perhaps meant as '{other}'" for other in get_close_matches(name, usual, n=1))
+        texts.append(f"'{name}' in {len(numbers)} row{'s' * (len(numbers) > 1)} ({few(numbers)}){meant}")
     return texts

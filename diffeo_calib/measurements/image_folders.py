@@ -176,9 +176,8 @@ def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str
     files = [sorted(order, key=lambda name: (order[name], name)) for order in places]
     others = [f"{len(each)} in '{folder}'" for folder, each in zip(folders, files, strict=True) if len(each) != count]
     if others:
-        expected, got = f"{count} images, one for each row of '{joints}'", few(others)
-        fix = "add a column `image` with the name of each row's file"
-        raise MeasurementError.of("images without names in the table", expected=expected, got=got, fix=fix)
+        expected, fix = f"{count} images, one for each row of '{joints}'", "name their files in a column `image`"
+        raise MeasurementError.of("images without names in the table", expected=expected, got=few(others), fix=fix)
     return files
 
 

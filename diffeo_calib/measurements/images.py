@@ -12,7 +12,7 @@ from torch import Tensor
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.poses import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import RowGroups, with_attributes
@@ -23,13 +23,11 @@ if TYPE_CHECKING:
 CAMERA_WARNED, CAMERA_REFUSED = 1.05, 5.0
 """Factors between the errors of corners with the given camera and with a free one, from which the images seem to show
 another camera. A focal length that is wrong by 1 % makes 1.06 of 60 images with errors of 0.2 px."""
-FEWEST_IMAGES = 8
-"""From which a free lens is well enough known to be compared."""
+FEWEST_IMAGES = 8  # from which a free lens is well enough known to be compared
 
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
-ONLY_CAMERA = "camera"
-"""Name of a camera that is alone."""
+ONLY_CAMERA = "camera"  # name of a camera that is alone
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
@@ -110,9 +108,7 @@ class ImageTable(RowGroups):
         priors = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
-            fix = (
-                "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
-            )
+            fix = "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that are not shown"
             raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
         checks.check_rows(angles, given, "corners")
         given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
@@ -155,9 +151,8 @@ class ImageTable(RowGroups):
             return names
         if self.board is not None:
             if not remounted or list(names) != self.camera_names:
-                what, fix = "several cameras on the tool", "calibrate with the images of each set-up by themselves"
-                got = few(list(dict.fromkeys(names)))
-                raise MeasurementError.of(what, expected="one board that stayed, so no set-ups", got=got, fix=fix)
+                fix = "calibrate with the images of each set-up by themselves"
+                raise MeasurementError.of("several cameras on the tool", expected="no set-ups", fix=fix)
             return names
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{camera}/") else f"{camera}/{name}" for camera, name in pairs]
@@ -273,9 +268,9 @@ def _sights(corners: Sequence[Tensor], priors: Mapping[str, Known], board: Board
             raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
         low, high = (torch.stack(list(shown.pixels[shown.seen].aminmax(dim=0)))).tolist()
         if min(low) < -1.0 or high[0] > shown.width or high[1] > shown.height:
-            got = f"from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
             expected = f"pixels within images of {shown.width} x {shown.height}"
-            fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
+            got = f"({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
+            fix = "pass the size of these images, or a camera calibrated at that size"
             raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
         images.append(shown)
     cameras = [prior if isinstance(prior, Camera) else None for prior in priors.values()]

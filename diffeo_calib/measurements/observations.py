@@ -7,18 +7,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, methods_outside_inference_mode
+from diffeo_calib.common.device import HOST, methods_outside_inference_mode, outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
 
-WITH_POSITION = ("position", "pose")
-"""Kinds of rows of which a device measures positions."""
+WITH_POSITION = ("position", "pose")  # kinds of rows of which a device measures positions
+
+
+def _in_order(values: Sequence[Any], index: Sequence[Tensor]) -> Any:
+    """Values (N_i, ...) or texts (N_i,) of parts with these row numbers (N_i,), in the order of the rows: (N, ...)."""
+    order = torch.cat(tuple(index)).argsort()
+    if isinstance(values[0], Tensor):
+        return torch.cat(list(values))[order.to(values[0].device)]
+    every = [text for part in values for text in part]
+    return [every[place] for place in order.tolist()]
+
+
+def _column(name: str) -> Any:
+    """What :class:`RowGroups` says of each row, of all parts."""
+    return property(lambda data: _in_order([getattr(part, name) for part in data.parts], data.index))
+
+
+NUMBERED = "device_names", "row_names", "places", "socket_numbers"
 
 
 @methods_outside_inference_mode
@@ -31,8 +47,9 @@ class Observations(RowGroups):
             order of their first rows.
         index: (N_i,) int64 for each part, its row numbers here.
 
-    Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload and covariates
-    hold the values of all rows. A line of a file that holds observations of several kinds is several rows.
+    Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload, covariates,
+    device_names, places and socket_numbers hold the values of all rows. A line of a file that holds observations of
+    several kinds is several rows.
     """
 
     parts: Any = ()
@@ -47,17 +64,12 @@ class Observations(RowGroups):
         alike |= {name: common([getattr(part, name) for part in tables]) for name in ("file_sha256", "origin")}
         for name in ("q", "line_numbers", "payload", "covariates"):
             columns = [getattr(part, name) for part in tables]
-            alike[name] = None if columns[0] is None else self._whole(columns)
+            alike[name] = None if columns[0] is None else _in_order(columns, self.index)
         set_attributes(self, **alike)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:
-        """The rows of several tables in order: :class:`Measurements`, :class:`Readings` or observations.
-
-        Raises:
-            MeasurementError: no table; tables that differ in joints or payloads; positions with other markers, poses
-                on other tips, other sockets, or a ball on another tip.
-        """
+        """The rows of several tables in order, see :meth:`Measurements.joined`."""
         return joined_tables(parts, apart=True)
 
     @property
@@ -67,24 +79,16 @@ class Observations(RowGroups):
         parts = {f"part {k}": part.sha256.encode() for k, part in enumerate(self.parts)}
         return self.file_sha256 or arrays_sha256(rows, parts)
 
+    device_names, row_names, places, socket_numbers = map(_column, NUMBERED)
+
     @property
     def kinds(self) -> tuple[str, ...]:
         """(N,) "position", "pose", "socket", or the kind of readings."""
-        return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the device of each row, or of its set-up; "" without one. Kinds have devices of their own."""
-        return self._texts([part.device_names for part in self.parts])
-
-    @property
-    def row_names(self) -> list[str]:
-        """(N,) how texts name the rows."""
-        return self._texts([part.row_names for part in self.parts])
+        return tuple(_in_order([[part.kind] * len(part) for part in self.parts], self.index))
 
     @property
     def session_names(self) -> tuple[str, ...]:
-        """Names of the devices and set-ups, in order of first appearance."""
+        """Names of the devices and set-ups, in order of first appearance; kinds have devices of their own."""
         return tuple(dict.fromkeys(name for name in self.device_names if name))
 
     @property
@@ -97,16 +101,6 @@ class Observations(RowGroups):
     def without_device(self) -> bool:
         """Whether neither a position nor a pose was measured."""
         return not any(part.kind in WITH_POSITION for part in self.parts)
-
-    @property
-    def places(self) -> Tensor:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
-        return self._whole([part.places for part in self.parts])
-
-    @property
-    def socket_numbers(self) -> Tensor:
-        """(N,) int64, number of each row's socket, -1 for other rows."""
-        return self._whole([part.socket_numbers for part in self.parts])
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint")
@@ -140,53 +134,40 @@ class Observations(RowGroups):
         pairs = zip(self.parts, self.index, strict=True)
         return Observations([change(part, rows) for part, rows in pairs], self.index)
 
-    def _whole(self, values: Sequence[Tensor]) -> Tensor:
-        """Values (N_i, ...) of the parts in the order of the rows: (N, ...)."""
-        return torch.cat(list(values))[torch.cat(self.index).argsort().to(values[0].device)]
 
-    def _texts(self, texts: Sequence[Sequence[str]]) -> list[str]:
-        """Join texts."""
-        every = [text for part in texts for text in part]
-        return [every[place] for place in torch.cat(self.index).argsort().tolist()]
-
-
-class Rows(NamedTuple):
-    """A table of one kind, and its row numbers (M,) in the whole."""
-
-    table: Any
-    rows: Tensor
-
-
-def _pieces(tables: Sequence[Any]) -> list[Rows]:
-    """The parts of all tables, numbered one table after another."""
+def _pieces(tables: Sequence[Any]) -> list[tuple[Any, Tensor]]:
+    """The parts of all tables, each with its row numbers (M,), one table after another."""
     given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
-    if not given:
-        raise MeasurementError.of("tables to join", expected="at least one", got="none")
-    for table in given:
-        if not isinstance(table, RowGroups):
-            expected, got = "dc.Measurements, dc.Readings or Observations", type(table).__name__
-            raise MeasurementError.of("tables to join", expected=expected, got=got)
+    if not given or not all(isinstance(table, RowGroups) for table in given):
+        got = few([type(table).__name__ for table in given if not isinstance(table, RowGroups)])
+        raise MeasurementError.of("tables to join", expected="at least one of dc.Measurements or dc.Readings", got=got)
     pieces, start = [], 0
     for table in given:
-        pieces += [Rows(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
+        pieces += [(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
         start += len(table)
     return pieces
 
 
+@outside_inference_mode
 def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
-    """The rows of several tables in order: one table of measurements or readings if it can hold them, unless ``apart``.
+    """The rows of several tables in order: :class:`Measurements` or :class:`Readings` if one table can hold them.
 
-    Rows of the same kind are one part.
+    These are rows with the same columns; rows of several kinds, and all with ``apart``, become :class:`Observations`.
+    Beside images of a board positions and rows in sockets become readings of points of the same tool, see
+    sensors/tool_frames.py.
+
+    Raises:
+        MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
     """
     pieces = _pieces(tables)
-    groups: dict[object, list[Rows]] = {}
-    if any("corners" in piece.table.columns for piece in pieces):
-        pieces = [Rows(part, piece.rows[here]) for piece in pieces for part, here in piece.table.beside_images()]
-    for piece in pieces:
-        groups.setdefault(piece.table.column_kind, []).append(piece)
-    parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
-    rows = [torch.cat([piece.rows for piece in group]) for group in groups.values()]
-    return Observations(parts, rows) if apart or len(parts) > 1 else parts[0].rows(rows[0].argsort())
+    if any("corners" in table.columns for table, _ in pieces):
+        pieces = [(part, rows[here]) for table, rows in pieces for part, here in table.beside_images()]
+    groups: dict[object, list[tuple[Any, Tensor]]] = {}
+    for table, rows in pieces:
+        groups.setdefault(table.column_kind, []).append((table, rows))
+    parts = [type(group[0][0]).in_one([table for table, _ in group]) for group in groups.values()]
+    numbers = [torch.cat([rows for _, rows in group]) for group in groups.values()]
+    return Observations(parts, numbers) if apart or len(parts) > 1 else parts[0].rows(numbers[0].argsort())
 
 
 def _check_joinable(tables: Sequence[Any]) -> None:
@@ -202,6 +183,5 @@ def _check_joinable(tables: Sequence[Any]) -> None:
             ways.setdefault((table.kind, name), set()).add(table.column_kind)
     several = [f"{kind}s of '{name}'" for (kind, name), each in ways.items() if len(each) > 1]
     if several:
-        expected = "one kind of zero, lens, unit and known deviations for a device"
         fix = "name different devices differently, and give the deviations of all readings of a device, or of none"
-        raise MeasurementError.of(few(sorted(several)), expected=expected, got="several", fix=fix)
+        raise MeasurementError.of(few(sorted(several)), expected="one zero, lens and unit of a device", fix=fix)

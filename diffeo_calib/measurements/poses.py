@@ -8,7 +8,8 @@ the pose back. One frame is measured or one on each of several tips: (N, T, 4, 4
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from math import pi
 
 import torch
@@ -17,15 +18,13 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_number, real_tensor, wrapped
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.checks import quiet
-from diffeo_calib.measurements.table_format import numbers_of
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, ANGLE_UNITS, numbers_of
 from diffeo_calib.robots.se3 import ONE_POSE, TOLERANCE, Place, checked_rotations, rigid_poses, skew, transforms
 
 MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
-POINTS = 3
-"""Points that represent a frame."""
-FLATTEST_TRIANGLE_LEVERS = 1e-3
-"""Points whose triangle is thinner than this, in levers, have no orientation."""
+POINTS = 3  # points that represent a frame
+FLATTEST_TRIANGLE_LEVERS = 1e-3  # points whose triangle is thinner than this, in levers, have no orientation
 
 
 def marks(device: torch.device) -> Tensor:
@@ -68,6 +67,14 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
     else:
         rotation = Rotation.from_euler(convention, numbers, degrees=degrees)
     return torch.as_tensor(rotation.as_matrix(), dtype=torch.float64, device=table.device)
+
+
+def readings_of(numbers: Tensor) -> Iterator[tuple[str, str, Tensor]]:
+    """Convention, unit and rotations (N, 3, 3) of numbers (N, k), in all conventions in which they write rotations."""
+    for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == numbers.shape[1]):
+        for angle in ANGLE_UNITS if numbers.shape[1] == 3 else ANGLE_UNITS[:1]:
+            with suppress(InputError):
+                yield convention, angle, rotation_matrices(numbers, convention, angle=angle)
 
 
 def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -> Tensor:
@@ -124,8 +131,7 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     spread = (places - places.mean(1, keepdim=True)).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
     thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
     if bool((thickness < FLATTEST_TRIANGLE_LEVERS).any()):
-        row = int((thickness < FLATTEST_TRIANGLE_LEVERS).nonzero()[0])
-        what = f"row {row}: the three points of the pose lie on one line"
+        what = f"row {int((thickness < FLATTEST_TRIANGLE_LEVERS).nonzero()[0])}: the points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
     return poses_of_triangles(places)
 

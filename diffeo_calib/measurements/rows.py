@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, check_seed
-from diffeo_calib.common.data_frames import data_frame, table_html
+from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import MeasurementError, as_written, printable, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, warn_user
 from diffeo_calib.measurements import checks
 
 if TYPE_CHECKING:
@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     from diffeo_calib.robots.payload import Payload
 
 T = TypeVar("T")
+ON_HOST = ("line_numbers", "session", "device", "seen_by")  # columns of numbers that stay on the host
+NO_SOCKET = -1  # number of the socket of rows whose positions a device measured
+REPEAT_TOLERANCE = 1e-3  # configurations closer than this in every joint [rad or m] are repeats of one another
+FEWEST_PER_DEVICE = 8  # rows of a device that reports readings, with which it can be placed
+CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"  # words for what a split keeps together
 
 
 def with_attributes(data: T, **attributes: object) -> T:
     """A copy with other attributes."""
-    changed = copy(data)
-    set_attributes(changed, **attributes)
+    set_attributes(changed := copy(data), **attributes)
     return changed
 
 
@@ -36,18 +40,6 @@ def set_attributes(data: object, **attributes: object) -> None:
     """Fill attributes of a frozen object."""
     for name, value in attributes.items():
         object.__setattr__(data, name, value)
-
-
-ON_HOST = ("line_numbers", "session", "device", "seen_by")
-"""Columns of numbers that stay on the host."""
-NO_SOCKET = -1
-"""Number of the socket of rows whose positions a device measured."""
-REPEAT_TOLERANCE = 1e-3
-"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
-FEWEST_PER_DEVICE = 8
-"""Rows of a device that reports readings, with which it can be placed."""
-CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
-"""Words for what a split keeps together."""
 
 
 @methods_outside_inference_mode
@@ -60,14 +52,11 @@ class RowGroups:
         covariates: (N, K) values with which something may drift, such as times and temperatures, in any unit.
     """
 
-    BY_ROW: ClassVar[tuple[str, ...]] = ()
-    """Attributes with a value for each row, all of them tensors (N, ...)."""
-    ALIKE: ClassVar[tuple[str, ...]] = ()
-    """Other attributes in which tables agree that are joined."""
+    BY_ROW: ClassVar[tuple[str, ...]] = ()  # attributes with a value for each row, all of them tensors (N, ...)
+    ALIKE: ClassVar[tuple[str, ...]] = ()  # other attributes in which tables agree that are joined
     NUMBERED: ClassVar[tuple[str, str]]
     """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-    flattery: ClassVar[str] = ""
-    """What errors of these rows do not show where no device measured a position."""
+    flattery: ClassVar[str] = ""  # what errors of these rows do not show where no device measured a position
 
     q: Tensor
     line_numbers: Tensor
@@ -78,11 +67,9 @@ class RowGroups:
     origin: object | None = None
     covariates: Tensor | None = None
     covariate_names: tuple[str, ...] = ()
-    without_device: bool = True
-    """Whether neither a position nor a pose was measured."""
+    without_device: bool = True  # whether neither a position nor a pose was measured
     kind: Any
-    compared: Any
-    """(N, c) numbers in which a row that repeats another one equals it."""
+    compared: Any  # (N, c) numbers in which a row that repeats another one equals it
     measured: Any
     """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
 
@@ -124,9 +111,7 @@ class RowGroups:
     def rows(self, index: object) -> Self:
         """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
 
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
+        IndexError for an index out of range, MeasurementError for an empty selection, or nothing that chooses rows.
         """
         chosen = checks.chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
@@ -150,11 +135,11 @@ class RowGroups:
         """Warn about exact copies of rows and joint values that look like degrees."""
         if doubt:
             self.warn_of_copies()
-        largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
-        if doubt and largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
-            name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
-            text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
-            warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
+            largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
+            if largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
+                name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
+                text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like "
+                warn_user(f"{text}millimetres of a prismatic joint; convert them to rad or m if they are.")
         return self
 
     def warn_of_copies(self) -> None:
@@ -169,22 +154,16 @@ class RowGroups:
         """Tables that one table can hold, in order; MeasurementError if they differ in their columns."""
         if len(tables) == 1:
             return tables[0]
-        tables = cls.of_one_layout(tables)
-        check_alike(tables, cls.BY_ROW, cls.ALIKE)
-        whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
-        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
-        return with_attributes(tables[0], **whole, **same)
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """Give tables the same columns, those of a few being empty, and set-ups or devices numbered alike."""
-        column, texts = cls.NUMBERED
+        column, texts = cls.NUMBERED  # of set-ups or devices, whose numbers become those of all
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
         parts = []
         for table in tables:
             new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
             parts.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
-        return parts
+        check_alike(parts, cls.BY_ROW, cls.ALIKE)
+        whole = {name: torch.cat([table.columns[name] for table in parts]) for name in parts[0].columns}
+        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
+        return with_attributes(parts[0], **whole, **same)
 
     @property
     def n(self) -> int:
@@ -236,10 +215,8 @@ class RowGroups:
             return self.with_columns(payload=None, payload_at=at)
         fix = "pass one mass for all rows, or one for each"
         masses = checks.copied(payload, "payload", (), (len(self),), fix=fix).to(self.q.device)
-        negative = (masses.reshape(-1) < 0).nonzero().flatten().tolist()
-        if negative:
-            what = f"`payload`, row {negative[0]}" if masses.ndim else "`payload`"
-            got = f"{float(masses.reshape(-1)[negative[0]]):g}"
+        if negative := (masses.reshape(-1) < 0).nonzero().flatten().tolist():
+            what, got = f"`payload`, row {negative[0]}" if masses.ndim else "`payload`", f"{float(masses.min()):g}"
             raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
         return self.with_columns(payload=masses.expand(len(self)).clone(), payload_at=at)
 
@@ -255,8 +232,7 @@ class RowGroups:
         given = {name: values for name, values in (("time", time), ("temperature", temperature)) if values is not None}
         fix = "pass a finite number for each row"
         parts = [checks.copied(values, name, (len(self),), fix=fix).to(self.q.device) for name, values in given.items()]
-        columns = torch.stack(parts, 1) if parts else None
-        return self.with_columns(covariates=columns, covariate_names=tuple(given))
+        return self.with_columns(covariates=torch.stack(parts, 1) if parts else None, covariate_names=tuple(given))
 
     def with_load(self, load: Payload) -> Self:
         """The same rows with the masses of a payload, if there is one."""
@@ -278,18 +254,6 @@ class RowGroups:
                 earlier = first.setdefault(numbers.tobytes(), row)
                 pairs += [(min(earlier, row), max(earlier, row))] * (earlier != row)
         return sorted(pairs, key=lambda pair: pair[1])
-
-    def _repr_html_(self) -> str:
-        ranges = list[tuple[str, Tensor, str]]()
-        for joint, values in enumerate(self.q.T):
-            turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
-            name = printable(self.joint_names[joint]) if self.joint_names else f"joint {joint}"
-            ranges.append((name, values, turns))
-        measured = (column for part in self.parts for column in part.measured().items())
-        ranges += [(name, values, "") for name, values in measured if isinstance(values, Tensor)]
-        finite = ((name, values[~values.isnan()], turns) for name, values, turns in ranges)
-        rows = [[name, f"{float(v.min()):.4f}", f"{float(v.max()):.4f}", turns] for name, v, turns in finite if len(v)]
-        return table_html(repr(self), ("column", "from [rad, m or px]", "to", "degrees"), rows)
 
     @property
     def masses(self) -> Tensor:
@@ -334,8 +298,8 @@ class RowGroups:
         """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
 
         Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
-        repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
-        rows. A device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
+        repeats go in random order to ``train`` where that brings its size nearer to ``round(fraction * N)`` rows. A
+        device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
 
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
@@ -357,9 +321,7 @@ class RowGroups:
         """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
 
         Where some positions were measured, they cover these: rows in sockets are in every ``train``.
-
-        Raises:
-            MeasurementError: k below 2, or fewer distinct configurations than folds.
+        MeasurementError for k below 2, or fewer distinct configurations than folds.
         """
         if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
             raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
@@ -437,8 +399,7 @@ def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> t
         checked_seed = check_seed(seed)
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
-        together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
-        got = f"{len(sizes)} (in {len(labels)} rows; {together} stay together)"
-        fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
+        got = f"{len(sizes)} (in {len(labels)} rows; repeats, and the rows of a place, stay together)"
+        fix = "measure more of them, or ask for fewer parts"
         raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
     return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))

@@ -15,15 +15,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.bodies import BALL, Bodies
 from diffeo_calib.measurements.images import ONE_SESSION, ImageTable
-from diffeo_calib.measurements.observations import Observations, joined_tables
-from diffeo_calib.measurements.readings import Readings, as_readings
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.readings import KIND, Distances, SocketReadings, as_readings, checked_distances
 from diffeo_calib.measurements.rows import set_attributes, with_attributes
-from diffeo_calib.measurements.sockets import KIND, Distances, SocketReadings, Sockets
 from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -47,8 +46,7 @@ class Measurements(ImageTable):
 
     Attributes:
         poses: (N, 4, 4) measured poses, m, or (N, T, 4, 4) on T tips; None for points. ``points`` are then the three
-            points of each pose, and ``on`` their tips.
-        lever: distance of these points from the pose's origin, m.
+            points of each pose, at the distance ``lever``, m, from its origin, and ``on`` their tips.
         board: (N, 3) for a camera on the tool, place of the board in its frame, m; deviations are along its axes then.
         std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, T, 3) for poses.
         rotation_std: (N, 3) or (N, T, 3) known standard deviations of the orientations, rad, about the measuring axes.
@@ -56,22 +54,18 @@ class Measurements(ImageTable):
         session_names: their names. remounted: whether the device stayed, and markers were mounted anew between them.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
-        line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
-            table. Subsets keep the line numbers of their rows.
-        file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
-        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv.tables.TableOrigin`; None for
-            arrays.
+        line_numbers: (N,) int64, of every row in the file or the original table, also in subsets.
+        file_sha256, origin: of the file that the rows were read from, see
+            :class:`~diffeo_calib.measurements.csv.tables.TableOrigin`; None for arrays.
 
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
     Raises:
         MeasurementError: wrong shape, no row, different numbers of rows, NaN (but for hidden markers), infinite or
-            impossibly large values (the first is named), a number of names that does not match, a standard deviation
-            that is not positive.
+            impossibly large values, a number of names that does not match, a standard deviation that is not positive.
 
     Warns:
-        DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
-            Nothing is dropped.
+        DiffeoCalibWarning: exact repeats of a row, joint values so large that they look like degrees; none is dropped.
     """
 
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload")
@@ -126,26 +120,23 @@ class Measurements(ImageTable):
             on: names of the tips that carry the frames, T of them, for a robot with several tips.
             lever: distance from the frame's origin to the three points that represent a pose, m. It weighs
                 orientation against position: with 0.1 m, an error of 1 mrad counts as much as one of 0.1 mm.
-            position_std: known standard deviations of the positions, m: one for all, (N,) or (N, 3); of several frames
-                one for all, (N,), (N, T) or (N, T, 3).
-            rotation_std: known standard deviations of the orientations, rad, about the axes of the measuring frame,
-                in the same shapes.
+            position_std: known standard deviations of the positions, m, in shapes that begin (N, T, 3), with several
+                frames, or (N, 3), or one for all. rotation_std: of the orientations, rad, about the measuring axes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
                 poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.pose_jacobian`.
 
         Raises:
-            MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
-                standard deviation that is not positive.
+            MeasurementError: as the constructor; a transform that is not rigid; a lever that is not positive.
         """
         angles, joints = checks.joint_table(q, joint_names)
         with checks.of_measurements():
             frames, board = pose_math.checked_frames(poses).to(angles.device), None
             if camera_on_tool:
                 if frames.shape[1] > 1:
-                    what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
-                    fix += " poses of the cameras in the board's frame"
-                    raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
+                    fix = "calibrate each arm with its own camera, or give the cameras' poses in the board's frame"
+                    what, got = "poses of a camera on the tool", frames.shape[1]
+                    raise MeasurementError.of(what, expected="one tip", got=got, fix=fix)
                 frames, board = pose_math.inverse_poses(frames), frames[:, 0, :3, 3]
             points = pose_math.points_of_frames(frames, lever)
         checks.check_rows(angles, frames, "poses")
@@ -191,28 +182,17 @@ class Measurements(ImageTable):
             readings, whose ``device`` (N,) holds numbers of the sockets ``names``.
 
         Raises:
-            MeasurementError: not one name per row; a distance that is not positive, or between unknown sockets; a
-                distance without a standard deviation, or the other way round; else as the constructor.
+            MeasurementError: as the constructor; a distance that is not positive, between unknown sockets, or without a
+                standard deviation.
         """
         angles, joints = checks.joint_table(q, joint_names)
         numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
-        layout = Sockets.of(names, distances, distance_std)
-        apart = tuple((names[a], names[b], length) for a, b, length in layout.distances)
         zeros = torch.zeros(len(angles), 3, dtype=torch.float64, device=angles.device)
-        how: Any = {"joint_names": joints, "distances": apart, "distance_std": layout.distance_std}
+        apart = checked_distances(names, distances, distance_std)
+        how: Any = {"joint_names": joints, "distances": apart, "distance_std": distance_std and float(distance_std)}
         return SocketReadings(KIND, angles, zeros, numbers.to(HOST), names, **how).doubted(doubt)
 
-    @classmethod
-    def joined(cls, parts: Sequence[Measurements | Readings | Observations]) -> Any:
-        """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
-
-        These are rows with the same columns; rows of several kinds become :class:`Observations`. Beside images of a
-        board positions and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
-
-        Raises:
-            MeasurementError: tables that differ in joints, payloads, markers or known deviations.
-        """
-        return joined_tables(parts)
+    joined = staticmethod(joined_tables)
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """See :class:`RowGroups`; poses stay."""
@@ -361,12 +341,11 @@ class Measurements(ImageTable):
 
         Args:
             names: of the set-ups; None for one.
-            remounted: whether the device stayed instead, and the markers were mounted anew for each set-up: they all
-                have one measuring frame, and each its own places of the markers; the model's are those of the largest.
-                So are several cameras on the tool that see one board.
+            remounted: whether the device stayed instead, and the markers were mounted anew for each set-up: all have
+                one measuring frame, and each its own places of the markers, or of cameras that see one board.
 
         Raises:
-            MeasurementError: not one name per row, or poses with markers mounted anew, but for those of a camera on the
+            MeasurementError: not one name per row, poses with markers mounted anew, but for those of a camera on the
                 tool; several cameras on the tool, in several set-ups.
         """
         names = self.set_ups(names, remounted=remounted)
@@ -386,10 +365,8 @@ class Measurements(ImageTable):
         """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""
         never = (~self.seen_bodies).all(0).nonzero()[:, 0].tolist()
         if never:
-            more = f" (and {len(never) - 1} more)" * (len(never) > 1)
-            what = f"{self.body_names[never[0]]}{more} is hidden in all {len(self)} rows"
-            fix = f"leave {'this marker' if self.lever is None else 'it'} out, or use rows that show it"
-            raise MeasurementError.of(what, expected="some row that shows it", fix=fix)
+            what, fix = few([self.body_names[body] for body in never]), "leave it out, or use rows that show it"
+            raise MeasurementError.of(f"{what}: hidden in all {len(self)} rows", fix=fix)
 
     @property
     def present_sessions(self) -> tuple[str, ...]:

@@ -16,20 +16,16 @@ from typing import Any
 
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
 
-Names = Sequence[str] | Sequence[Sequence[str]]
-"""Names of columns: a list, or one for each marker or frame."""
+Names = Sequence[str] | Sequence[Sequence[str]]  # names of columns: a list, or one for each marker or frame
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
 """How many numbers write a rotation in each convention; an order of Euler angles takes three."""
 MAKERS = {"ur_rotvec": "rotvec", "abb_quaternion": "quat_wxyz", "kuka_abc": "ZYX", "fanuc_wpr": "xyz"}
 """Conventions by the names of controllers."""
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
-LEVER = 0.1
-"""Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
-ZERO = "0"
-"""In place of a column of z: all that was measured is in the plane of x and y."""
-UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
-"""A length in a file is divided by this."""
+LEVER = 0.1  # default distance [m] from a pose's origin to the three points that represent it: the size of usual tools
+ZERO = "0"  # in place of a column of z: all that was measured is in the plane of x and y
+UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}  # a length in a file is divided by this
 ROTATION_NAMES = {
     "rotvec": ("rx", "ry", "rz"),
     "quat_xyzw": ("qx", "qy", "qz", "qw"),
@@ -37,8 +33,7 @@ ROTATION_NAMES = {
     "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123"),
 }
 """Default names of the columns of a rotation that is written; euler1, ... for Euler angles."""
-SPHERICAL_UNITS = {"rad": 1.0, "deg": 180.0 / pi, "gon": 200.0 / pi}
-"""Units of the angles of devices, per rad."""
+SPHERICAL_UNITS = {"rad": 1.0, "deg": 180.0 / pi, "gon": 200.0 / pi}  # units of the angles of devices, per rad
 SPHERICAL = tuple(map("".join, product(("elevation", "zenith"), ("_", "_clockwise_"), SPHERICAL_UNITS)))
 """How a place is written as a distance, a horizontal angle, and one above the horizon, or from the zenith."""
 BESIDE = ("time", "temperature", "payload")
@@ -127,14 +122,12 @@ class TableFormat:
         check_choice("joint_length", self.joint_unit, tuple(UNITS_PER_METRE))
         check_choice("decimal", self.decimal, (".", ","))
         check_choice("spherical", self.spherical or SPHERICAL[0], SPHERICAL)
-        sep = self.sep
-        if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
+        if not isinstance(self.sep, str) or len(self.sep) != 1 or self.sep in '"\r\n':
             fix = "pass ',' or ';' or '\\t'"
-            raise MeasurementError.of("`sep`", expected="one character", got=as_written(sep), fix=fix)
-        if sep == self.decimal:
+            raise MeasurementError.of("`sep`", expected="one character", got=as_written(self.sep), fix=fix)
+        if self.sep == self.decimal:
             fix = "pass sep=';' if the numbers have decimal commas"
-            got = f"{sep!r} for both"
-            raise MeasurementError.of("`sep` and `decimal`", expected="different characters", got=got, fix=fix)
+            raise MeasurementError.of("`sep` and `decimal`", expected="different characters", got=self.sep, fix=fix)
 
     @property
     def beside(self) -> dict[str, str]:
@@ -174,27 +167,26 @@ class TableFormat:
         Raises:
             MeasurementError: a convention or unit that is missing, unknown or not needed, or a wrong number of names.
         """
+        std, unit = self.rotation_std, self.rotation_angle
         if self.rotation is None:
-            options = ("convention", "rotation_angle", "rotation_std")
-            names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
-            if names or self.camera_on_tool:
+            given = {"convention": self.convention, "rotation_angle": unit, "rotation_std": std}
+            given |= {"camera_on_tool": self.camera_on_tool or None}
+            if names := " and ".join(f"`{name}`" for name, value in given.items() if value is not None):
                 fix = "name the columns of the rotation too, or leave this out"
-                raise MeasurementError.of(f"{names or '`camera_on_tool`'} without `rotation`", fix=fix)
+                raise MeasurementError.of(f"{names} without `rotation`", fix=fix)
             return self
         if self.convention is None:
             what = "`rotation` is given, but its `convention` is not"
             raise MeasurementError.of(what, expected=CONVENTIONS, fix="name it: it is never guessed")
         count = numbers_of(self.convention, error=MeasurementError)
-        expected = f"{count} names of columns for {self.convention!r}"
-        rotation = by_frame("rotation", self.rotation, expected, count)
-        std, unit = self.rotation_std, self.rotation_angle
+        rotation = by_frame("rotation", self.rotation, f"{count} names of columns for {self.convention!r}", count)
         if std is not None:
             std = by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
-        if unit is None and (count == 3 or std is not None):
-            what = "`rotation_angle` is missing: the unit of " + ("the rotation" if count == 3 else "`rotation_std`")
-            fix = "name it, for it may differ from the unit of the joints"
+        angles = count == 3 or std is not None
+        if angles and unit is None:
+            what, fix = "`rotation_angle` is missing", "name it, for it may differ from the unit of the joints"
             raise MeasurementError.of(what, expected="'rad' or 'deg'", fix=fix)
-        if unit is not None and count != 3 and std is None:
+        if unit is not None and not angles:
             what = f"`rotation_angle` beside convention {self.convention!r}, which has no angles"
             raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
         check_choice("rotation_angle", unit or "rad", ANGLE_UNITS)
@@ -206,17 +198,17 @@ class TableFormat:
         ``rotation_std``: whether their standard deviations are written, too. ``prefixes``: what the default names of
         the columns of each frame begin with. MeasurementError for an unknown convention, unit or number of names.
         """
-        convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
-        count = numbers_of(convention, error=MeasurementError)
-        check_choice("rotation_angle", unit, ANGLE_UNITS)
+        convention = self.convention or "rotvec"
+        angles = rotation_std or numbers_of(convention, error=MeasurementError) == 3
         plain = ROTATION_NAMES.get(convention, ("euler1", "euler2", "euler3"))
-        names = by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
-        std = self.rotation_std  # of which the writer says that there are no values
-        if rotation_std:
-            given = std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
-            std = by_frame("rotation_std", given, "three names", 3)
-        angle = unit if count == 3 or rotation_std else None
-        return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
+        std = self.rotation_std or ([[f"std_{each}r{k}" for k in "xyz"] for each in prefixes] if rotation_std else None)
+        return replace(
+            self,
+            convention=convention,
+            rotation=self.rotation or [[f"{each}{name}" for name in plain] for each in prefixes],
+            rotation_angle=(self.rotation_angle or self.angle) if angles else None,
+            rotation_std=std if std is None else by_frame("rotation_std", std, "three names", 3),
+        ).for_reading()
 
 
 def numbers_of(convention: object, angle: object = "rad", error: type[InputError] = InputError) -> int:
@@ -252,16 +244,16 @@ def described() -> dict[str, str]:
 
 def options_of(table: TableFormat) -> list[str]:
     """The options with which the command line reads positions or poses that are written so, word by word."""
-    lever = f"{table.lever * table.per_metre:.17g}" if table.rotation and table.lever != LEVER else None
     texts = {field.name: getattr(table, field.name) for field in fields(table)}
     way = f"{table.spherical}=" * (table.spherical is not None)
-    texts |= {"position": [[way + ",".join(names)] for names in table.triples], "lever": lever}
+    texts |= {"position": [[way + ",".join(names)] for names in table.triples]}
     texts |= {"joints": ",".join(table.joints), "std": ",".join(flat_names(table.std))}
+    texts |= {"lever": f"{table.lever * table.per_metre:.17g}" if table.rotation and table.lever != LEVER else None}
     words = list[str]()
     for name, value in texts.items():
         if value and name not in ("kinds", "on", "sockets", "readings", "spherical"):
-            option = f"--{name.replace('_', '-')}"
             each = [value] if isinstance(value, str) else [] if value is True else map(",".join, value)
+            option = f"--{name.replace('_', '-')}"
             words += [option] if value is True else [word for text in each for word in (option, text)]
     return words
 
@@ -280,11 +272,6 @@ def by_frame(what: str, names: object, expected: str, *counts: int) -> tuple[tup
         got = " and ".join(str(len(group)) for group in groups)
         raise MeasurementError.of(f"`{what}`", expected="as many names for every frame", got=got)
     return groups
-
-
-def _prefixed(prefixes: Sequence[str], names: Sequence[str], before: str = "") -> Names:
-    """The names behind each prefix."""
-    return [[f"{before}{prefix}{name}" for name in names] for prefix in prefixes]
 
 
 def column_names(what: str, names: object, expected: str, counts: Sequence[int]) -> tuple[str, ...]:

@@ -17,9 +17,8 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET
-from diffeo_calib.measurements.sockets import KIND, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
@@ -326,7 +325,7 @@ class Contacts(OtherDevices):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data.sockets)[0].norm(dim=1)
+            away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data)[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         spread = share(data.q)
@@ -347,11 +346,11 @@ class Contacts(OtherDevices):
 
     def errors(self, data: SocketReadings, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        away, distances = socket_errors(points[:, -1], data.device.to(points.device), data.sockets)
+        away, distances = socket_errors(points[:, -1], data.device.to(points.device), data)
         return replace(self._spread(data, away), distances=distances)
 
     def away(self, data: SocketReadings, points: Tensor, places: Places) -> Tensor:
-        return socket_errors(points[:, -1], data.device.to(points.device), data.sockets)[0]
+        return socket_errors(points[:, -1], data.device.to(points.device), data)[0]
 
     def in_unit(self, data: SocketReadings, devices: Devices, errors: Tensor) -> Evaluation:
         return self._spread(data, errors.masked_fill(alone(data.device).to(errors.device)[:, None], torch.nan))

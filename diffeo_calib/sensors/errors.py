@@ -13,7 +13,7 @@ from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.quantiles import known, quantile
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.readings import SocketReadings
 
 NAMES = ("rms", "median", "p95", "max")
 SIZES = ("RMS", "median", "95 %", "max")
@@ -54,7 +54,9 @@ class DistanceError:
         return self.found - self.known
 
 
-def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[Tensor, tuple[DistanceError, ...]]:
+def socket_errors(
+    predicted: Tensor, socket: Tensor, sockets: SocketReadings
+) -> tuple[Tensor, tuple[DistanceError, ...]]:
     """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean.
 
     Returns:
@@ -66,7 +68,7 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[
     used = (count > 0).tolist()
     distances = tuple(
         DistanceError(sockets.names[a], sockets.names[b], length, float((middles[a] - middles[b]).norm()))
-        for a, b, length in sockets.distances
+        for a, b, length in sockets.lengths
         if used[a] and used[b]
     )
     alone = (count == 1)[socket]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.measurements.observations import Observations, Rows
+from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.poses import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import with_attributes
@@ -14,6 +16,13 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.kinds import kind_of
 
 ORDER = {"position": 0, "pose": 0, "socket": 1}
+
+
+class Rows(NamedTuple):
+    """A table of one kind, and its row numbers (M,) in the whole."""
+
+    table: Any
+    rows: Tensor
 
 
 Coordinates = OtherReadings = Rows

@@ -24,7 +24,7 @@ from torch import Tensor
 from diffeo_calib.maps.observation import FromPlaces, Observation
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import POINTS
-from diffeo_calib.measurements.sockets import KIND
+from diffeo_calib.measurements.readings import KIND
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.placement import PLACES, place
 from diffeo_calib.robots.se3 import nearest_rotations

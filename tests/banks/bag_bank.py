@@ -1,7 +1,5 @@
 """Small ROS 2 bags; needs rosbags."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

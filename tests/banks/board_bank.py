@@ -1,7 +1,5 @@
 """Images of a board with a known lens, as corners."""
 
-from __future__ import annotations
-
 import torch
 from simulated_camera import FEWEST_SEEN, HEIGHT, WIDTH, seen_corners, true_camera
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Generated C sources, compiled with all warnings as errors and called by ctypes."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The command line in a test: through `main()` in this process, or as a real process; and a robot with its table."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Robots in general position, without a fit: every kernel, error and parameter differs from zero; large momenta."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

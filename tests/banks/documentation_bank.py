@@ -1,7 +1,5 @@
 """Tables under the names that README and site use, and the outputs that tutorials show."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

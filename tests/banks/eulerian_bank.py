@@ -1,7 +1,5 @@
 """The paper's formulation for tests: variants of its equations and a small problem."""
 
-from __future__ import annotations
-
 from itertools import product
 
 from math_bank import K_V, K_W, normal, uniform

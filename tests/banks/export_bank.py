@@ -1,7 +1,5 @@
 """For tests of exports: an ugly but valid URDF, geometries in general position, poses by pinocchio, rigid models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

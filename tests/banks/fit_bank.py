@@ -1,7 +1,5 @@
 """Fitting problems for tests: noise blocks, deformations and starts away from zero, interruptions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Tables of a simulated arm for `init`; measured with a tracker, in sockets, and by a wire from two anchors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,8 +31,6 @@ def reasons(text: str) -> dict[str, str]:
     lines = [line.partition("  # ") for line in text.splitlines() if not line.startswith("#")]
     return {line.partition(" = ")[0]: why for line, _, why in lines}
 
-
-# --- without a tracker ------------------------------------------------------------------------------------------------
 
 ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
 """(2, 3) Fixed points of the wire in the robot's base frame, m."""

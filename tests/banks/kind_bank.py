@@ -3,8 +3,6 @@
 A part of the rows is kept for the verbs that judge. The models' numbers are held by tests/golden.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 import tempfile
@@ -261,8 +259,6 @@ def of_payload(kind: Kind) -> dc.CalibratedKinematics:
     """The model at the payload of the truth."""
     return kind.model.with_payload(4.0) if kind.name == "payloads" else kind.model
 
-
-# --- checks -----------------------------------------------------------------------------------------------------------
 
 NUMBERED = ("line_numbers", "device", "session", "socket")
 FROM_IMAGES = ("points", "poses", "board", "pose_covariance", "pose_shared", "pose_larger")

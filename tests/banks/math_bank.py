@@ -3,8 +3,6 @@
 The second implementations use explicit pairs and plain autograd; they share only data types with the package.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Model files for tests: fits of a planar arm, headers of files, and an editor that renews the checksum."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable

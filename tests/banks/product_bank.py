@@ -4,8 +4,6 @@ The covariance formulas are those of DESIGN sections 5 and 6, with explicit loop
 nothing is shared with the package but the data types and the geometry's derivatives.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -178,9 +176,6 @@ def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measur
     points = truth.absorb(torch.from_numpy(theta)).points(q + torch.stack(error, 1))
     noise = 1e-5 * rng.standard_normal(tuple(points.shape))
     return dc.Measurements(q, points + torch.from_numpy(noise), robot.joint_names)
-
-
-# --- the tangent model, written a second time ---------------------------------------------------------------------
 
 
 def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:

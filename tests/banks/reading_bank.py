@@ -1,7 +1,5 @@
 """Distances, heights and images of the ball of a simulated arm, and scales for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

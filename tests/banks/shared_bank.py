@@ -1,7 +1,5 @@
 """What takes seconds to make, such as fitted models: made by one process of a run, and read by all others."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import tempfile

@@ -1,7 +1,5 @@
 """Tables of every kind of measurement, and of several kinds in one, of simulated robots whose truth is known."""
 
-from __future__ import annotations
-
 import copy
 import tempfile
 from collections.abc import Callable

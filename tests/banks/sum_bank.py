@@ -1,7 +1,5 @@
 """Kernel sums for tests: points, profiles, formulas."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from typing import Any

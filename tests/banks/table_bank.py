@@ -1,7 +1,5 @@
 """Random measurements, patterns of messages, and conventions of rotations that the tests of tables share."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Nothing is shared with the package but data types, the nominal map and its derivatives by joints and error twists.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from math import pi
@@ -122,9 +120,6 @@ def prior_covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
 def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
     """The same with noise."""
     return prior_covariance(data, scales) + torch.block_diag(*data.noise_of_numbers(scales))
-
-
-# --- formulas -----------------------------------------------------------------------------------------------------
 
 
 def places(chain: Tree) -> list[int]:

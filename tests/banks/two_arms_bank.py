@@ -1,7 +1,5 @@
 """A small robot with two arms on one waist, five joints, and measured poses of both hands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clean tables of positions, as people make them, are not refused, and nothing untrue is said of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

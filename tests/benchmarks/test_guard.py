@@ -1,7 +1,5 @@
 """The guard finds what is worse; one of its robots is as good as recorded."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A handful of kills and faults: no file is lost or damaged, and no row that was answered."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

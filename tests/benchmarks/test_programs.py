@@ -1,7 +1,5 @@
 """Benchmarks of kernel sums: every way gives the same answer; of real robots: no row is on both sides of a split."""
 
-from __future__ import annotations
-
 import ours
 import peers
 import protocols

@@ -3,8 +3,6 @@
 A failure names the seed: `python benchmarks/robustness/PROGRAM.py --seed K --only` repeats it.
 """
 
-from __future__ import annotations
-
 import commands
 import model_files
 import pytest

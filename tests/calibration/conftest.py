@@ -1,7 +1,5 @@
 """Fixtures of the tests of scales: measurements of every kind after the geometric calibration."""
 
-from __future__ import annotations
-
 import pytest
 from tangent_bank import SETTINGS, Setting, built
 

@@ -1,7 +1,5 @@
 """`calibrate` on robots whose errors are known: gains of every stage, its arguments, and how it ends early."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -109,9 +107,6 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
 
 
-# --- calibrations that end early --------------------------------------------------------------------------------------
-
-
 def interrupting(task: str, at: int):
     """A progress callback that behaves as if Ctrl-C came at this place, once."""
     state = {"done": False}
@@ -139,16 +134,3 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     else:
         assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(geometry, arm.test).rms
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
-
-
-@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")
-def test_ctrl_c_ends_the_search_beside_what_may_drift(arm: Case) -> None:
-    tasks, interrupted = list[str](), interrupting("hyper-parameters", 1)
-
-    def progress(name: str, done: int, total: int) -> None:
-        tasks.append(name)
-        interrupted(name, done, total)
-
-    data = arm.train.with_covariates(time=torch.arange(len(arm.train)))
-    assert dc.calibrate(arm.robot, data, progress=progress).interrupted
-    assert tasks.count("hyper-parameters") <= 2, "no second search"

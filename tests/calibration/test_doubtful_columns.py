@@ -16,7 +16,7 @@ from tangent_bank import normal
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import stuck_columns, warn_of_stuck
+from diffeo_calib.calibration.diagnostics.judged_rows import stuck_columns, warn_of_stuck
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_identification,
     check_markers,
@@ -90,19 +90,23 @@ def planar_rows(wrong: int = 0) -> tuple[Any, dc.Measurements]:
 @pytest.mark.parametrize("wrong", [0, 28])
 def test_the_height_of_a_planar_robot_may_be_one_value(wrong: int) -> None:
     robot, data = planar_rows(wrong)
-    assert [one.words for one in stuck_columns(data)] == ["'z' of the positions"]
+    assert [words for words, _ in stuck_columns(data)] == ["'z' of the positions"]
     found, texts = warned(with_usual_scales, robot, data)
     assert len(found.outliers) >= 0.8 * wrong
-    assert any("one value" in one for one in texts) == bool(wrong)
+    assert any("are outliers" in one for one in texts) == bool(wrong)
+    assert not any("one value" in one for one in texts)
 
 
 def test_deviations_and_a_few_rows_are_no_stuck_columns_and_others_are() -> None:
     data = kind_named("positions").data
-    assert stuck_columns(with_attributes(data, std=torch.full_like(data.points, 2e-5))) == []
-    assert stuck_columns(stuck(data.rows(slice(5)), "position")) == []
+    for right in (
+        with_attributes(data, std=torch.full_like(data.points, 2e-5)),
+        stuck(data.rows(slice(5)), "position"),
+    ):
+        assert not [*stuck_columns(right)]
     for name, rows, column in (("heights", "height", "height"), ("images", "image", "v")):
-        (found,) = stuck_columns(stuck(kind_named(name).data, rows))
-        assert f"'{column}' of the {rows}s" in found.words
+        ((words, _),) = stuck_columns(stuck(kind_named(name).data, rows))
+        assert f"'{column}' of the {rows}s" in words
     hidden = kind_named("hidden markers")
     _, texts = warned(dc.calibrate, hidden.robot, stuck(hidden.data, "position"), hyperparameters=hidden.scales)
     assert any("'marker3_z' of the positions holds one value" in one for one in texts)
@@ -217,7 +221,7 @@ def test_markers_that_are_no_measurements_are_refused() -> None:
     )
     hidden = FIRST.clone()
     hidden[::2] = torch.nan
-    assert [one.proved for one in unmeasured_markers(PAIR.nominal, pair(FIRST, hidden))] == [True]
+    assert [proved for _, _, proved in unmeasured_markers(PAIR.nominal, pair(FIRST, hidden))] == [True]
     for rows in (PAIR_ROWS, PAIR_ROWS.rows(slice(8))):
         assert not list(unmeasured_markers(PAIR.nominal, rows))
 

@@ -1,7 +1,5 @@
 """Drift with a column of times or temperatures: found where it is, left out where it is not, undone in other rows."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 from again_bank import true_error
-from command_bank import Command
 from reading_bank import readings, scales
 from table_bank import refused, warned
 from tangent_bank import normal
@@ -168,28 +165,6 @@ def test_columns_that_cannot_be() -> None:
         ("time", lambda: table.with_covariates(time=[float("nan")] * 12)),
         ("covariate", lambda: dc.Measurements.joined([table, table.with_covariates(time=hours(12))])),
     )
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales", "undrawn")
-def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
-    form = TableFormat("mm", "deg", time="hour")
-    write_measurements(tmp_path / "t.csv", drifting_rows()[:ROWS], form)
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    robot = "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"
-    columns = "--length", "mm", "--angle", "deg", "--position", "x,y,z", "--time", "hour"
-    done = command("fit", tmp_path / "t.csv", *robot, *columns, "-o", tmp_path / "m.safetensors")
-    assert done.code == 0
-    assert "drift with time" in done.out
-    for name, *more in (
-        ("evaluate", tmp_path / "t.csv", "-o", tmp_path / "r.csv"),
-        ("evaluate", tmp_path / "t.csv", "--report", tmp_path / "r.html"),
-        ("export", "--c", tmp_path / "m.c"),
-        ("recalibrate", tmp_path / "t.csv"),
-    ):
-        said = command(name, tmp_path / "m.safetensors", *more)
-        assert "another set-up" not in said.err
-        assert re.search(r"drift with time from 3\S* to [67]\S* .* holds for [45]\.", said.out.replace("\n", " ")), said
 
 
 @pytest.mark.parametrize(("left", "better"), [([0.9] * 100, True), ([1.0] * 99 + [0.0], False), ([0.99] * 100, False)])

@@ -1,7 +1,5 @@
 """What a model expects of itself, and what its parts explain, against the truth of a simulated arm."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest
@@ -10,7 +8,6 @@ from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
 from kind_bank import kind_named, marked
 from product_bank import Case, simulated, with_usual_scales
-from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -84,9 +81,6 @@ def test_expectation_plan_and_stages_give_one_number(name: str) -> None:
     assert expected_errors(model, {"itself": model})["itself"] == pytest.approx(found.workspace)
 
 
-# --- parts of a model -------------------------------------------------------------------------------------------------
-
-
 def rms(displacements: Tensor) -> float:
     return 1e3 * float(displacements.reshape(-1, 3).square().sum(-1).mean().sqrt())
 
@@ -134,14 +128,3 @@ def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
         kernel = (1 + away + away**2 / 3) * (-away).exp()  # Matern 5/2
         expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.joint[:, index]
         assert_close(arm.model.transmission(name, values), expected, rtol=1e-9, atol=1e-15)
-
-
-def test_transmission_of_no_joint_or_of_nonsense(arm: Case) -> None:
-    of = arm.model.transmission
-    refused(
-        (r"`joint`: expected waist_joint, shoulder_joint, .*got", lambda: of("elbow", [0.0])),
-        ("`values` has the wrong shape", lambda: of("elbow_joint", 0.3)),
-        (r"1 value\(s\) that are not finite", lambda: of("elbow_joint", [torch.nan])),
-        ("`values` cannot be read as numbers", lambda: of("elbow_joint", "home")),
-    )
-    assert of("elbow_joint", []).shape == (0,)

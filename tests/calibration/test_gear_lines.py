@@ -1,19 +1,14 @@
 """Errors by the position of a joint: gear lines and axes, found by evidence; scales of other robots of its type."""
 
-from __future__ import annotations
-
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from math import pi
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from kind_bank import kind_named
-from product_bank import simulated, sliding_robot
+from product_bank import simulated
 from table_bank import refused
 from tangent_bank import Setting, covariance
 from torch import Tensor
@@ -26,18 +21,13 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.position_errors import _fall, _Scan, find_gear_lines, with_axis_errors
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.process.scales import DEVIATIONS, SCALES, TRANSMISSION_PROFILE, Hyperparameters, axis_deviations
 from diffeo_calib.regression.tails import Tails
-from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import from_dh
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.build import axis_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles
-
-# --- scales of other robots of the same type --------------------------------------------------------------------------
 
 
 def test_scales_are_those_of_the_other_model_but_for_one_factor() -> None:
@@ -71,8 +61,6 @@ def test_unusable_models_are_refused() -> None:
         (r"hyperparameters.*scales_of", calibrated([kind.model], hyperparameters=kind.scales)),
     )
 
-
-# --- gear lines: planted ones are found, none where there is none -----------------------------------------------------
 
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
@@ -149,9 +137,6 @@ def test_a_calibration_reports_its_lines_and_predicts_better() -> None:
     assert float(error.square().mean().sqrt()) < 5e-5  # 0.08 mm without the lines
 
 
-# --- errors of an axis by its own position --------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("joint", [0, 3])
 def test_the_axis_is_found(joint: int) -> None:
     """It is shifted and turned before the joint by smooth functions of its value; clean rows have none."""
@@ -211,50 +196,3 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     fall = (1.0 - (torch.pi * torch.cat([apart, apart.new_ones(1)])[:, None] * every).cos()) @ variances
     (kernel, _) = TRANSMISSION_PROFILE.derivatives((apart / (length[0] / 6.0)).square(), 1)
     assert_close(1.0 - fall[:-1] / fall[-1], kernel, rtol=0, atol=1e-5)
-
-
-def slid(q: Tensor) -> Tensor:
-    """True places (N, 1, 3) of a robot whose slide of 0.6 m is bent by 0.3 mm and pitches by 1 mrad."""
-    truth = replace(Geometry.nominal(sliding_robot()), tool=torch.tensor([[0.05, 0.02, 0.1]], dtype=torch.float64))
-    errors = torch.from_numpy(5e-4 * np.random.default_rng(7).standard_normal(truth.size)).repeat(len(q), 1)
-    errors[:, :6] = torch.tensor([1.0, 2.0, 0.5, 0.3, 0.2, 0.1])
-    errors[:, 18] += 3e-4 * (20 * q[:, 2]).sin()
-    errors[:, 22] += 1e-3 * (12 * q[:, 2]).cos()
-    return truth.points(q, errors)
-
-
-def configurations(rows: int, seed: int) -> Tensor:
-    rng = np.random.default_rng(seed)
-    return torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
-
-
-@pytest.mark.slow
-def test_a_bent_slide_is_part_of_the_model(tmp_path: Path) -> None:
-    """True errors and regions at other poses; beyond the measured range regions widen; files hold all."""
-    robot, q, new = sliding_robot(), configurations(60, 1), configurations(200, 2)
-    noise = 2e-5 * np.random.default_rng(3).standard_normal((60, 1, 3))
-    data = dc.Measurements(q, slid(q) + torch.from_numpy(noise), robot.joint_names)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        result = dc.calibrate(robot, data)
-    mean, covariance = result.model.predict(new, noise=False)
-    errors, covariance = (mean - slid(new)).flatten(1), covariance.reshape(200, 3, 3)
-    inside = ((errors * torch.linalg.solve(covariance, errors)).sum(1) < 7.815).double().mean()
-    assert 0.9 <= float(inside) <= 1.0
-    assert [axis[0] for axis in result.model.nominal.own.axes] == [2]
-    (part,) = [part for part in result.parts if part.name == "the axis of slide"]
-    assert 1e-4 < part.displacement < 1e-3
-    far = new.clone()
-    far[:, 2] = 0.66
-    wider = result.model.predict(far, noise=False)[1].reshape(200, 3, 3).diagonal(dim1=1, dim2=2).sum(1).mean()
-    assert float(wider) > 2.0 * float(covariance.diagonal(dim1=1, dim2=2).sum(1).mean())
-    values = torch.linspace(0.02, 0.58, 40, dtype=torch.float64)
-    moved = result.model.transmission("slide", values)  # there is none: its bend is not taken for one
-    inside = (moved - moved.mean()).abs() < 1.96 * FitRows(result.model).transmission_deviation(2, values)
-    assert 0.8 <= float(inside.double().mean()) <= 1.0
-    dc.save(result.model, tmp_path / "model.safetensors")
-    again = dc.load(tmp_path / "model.safetensors")
-    assert_close(again.predict(far)[1], result.model.predict(far)[1], rtol=1e-9, atol=0)
-    found = load_numpy(tmp_path / "model.safetensors")(far)
-    np.testing.assert_allclose(found, result.model(far).numpy(), rtol=0, atol=1e-12)
-    assert float(errors.square().sum(1).mean().sqrt()) < 7.5e-5  # 8.2e-5 without the axis

@@ -1,9 +1,6 @@
 """Geometric identification: parameters, noise, tails and prior, on simulated truth and on hardware."""
 
-from __future__ import annotations
-
 from math import inf
-from typing import Any
 
 import pytest
 import torch
@@ -12,9 +9,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import Prior, identify, solve
+from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry, SimulatedArm
 
 ARM = SimulatedArm()
@@ -97,30 +93,6 @@ def test_left_out_points_are_predicted_by_the_others() -> None:
         squares.append(float((alone.points(q[row : row + 1]) - points[row]).square().sum()))
     assert found.left_out == pytest.approx((sum(squares) / 25) ** 0.5, rel=0.1)
     assert found.left_out > 1.5 * found.rms
-
-
-class Ahead:
-    """One row with one unknown c, from c = 0.9 on nothing can be measured, such as behind a camera."""
-
-    freedom = (1,)
-
-    def errors(self, theta: Tensor, c: Tensor) -> list[Tensor]:
-        if float(c[0]) > 0.9:
-            raise InputError("behind the camera")
-        return [100 * (1 / (1 - c) - 2).view(1, 1, 1)]
-
-    def slopes(self, theta: Tensor, c: Tensor, root: Tensor) -> list[Tensor]:
-        return [100 / (1 - c).square().view(1, 1, 1, 1)]
-
-
-def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
-    """The first step of Gauss-Newton leads to c = 1."""
-    rows: Any = Ahead()
-    one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
-    found = solve(rows, one[0], none)
-    assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
-    with pytest.raises(InputError, match="behind"):
-        solve(rows, one[0], none, start=(one[0], one[0]))
 
 
 @pytest.mark.parametrize("axes", [3, 6])

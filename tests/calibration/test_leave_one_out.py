@@ -1,7 +1,5 @@
 """Rows and folds that are left out: weights, errors and deviations outside of the fit, by closed forms and refits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 from math import inf
@@ -12,7 +10,6 @@ import torch
 from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
-from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -98,20 +95,6 @@ def test_leave_one_out_is_refitting_without_the_row(name: str) -> None:
     assert found.effective == pytest.approx(trace, rel=1e-6)
 
 
-def test_several_blocks_are_predicted_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, scales = arm(2, 40).tangent_data, arm(2, 40).scales
-    whole = leave_one_out(data, scales)
-    monkeypatch.setattr(one_out, "BLOCK_COORDINATES", 130)
-    found = leave_one_out(data, scales, seed=3)
-    for rows, part in one_out._parts(data, 3):
-        alone = leave_one_out(part, scales)
-        assert_close(found.errors[rows], alone.errors, rtol=0, atol=1e-9)
-        assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
-    assert found.effective is None  # that of no single fit
-    assert not torch.allclose(leave_one_out(data, scales, seed=4).errors, found.errors, rtol=1e-3, atol=0)
-    assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows predict worse
-
-
 def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
     """95 % regions of three normal coordinates whose variance was estimated from nu further coordinates."""
 
@@ -127,9 +110,6 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
     assert inflation(None) == 1.0
     assert inflation(89.9) == inflation(82.0)
     assert inflation(70.0, 60) == inflation(70.0), "repeats add nothing"
-
-
-# --- folds ------------------------------------------------------------------------------------------------------------
 
 
 def test_rows_along_motions_and_repeats_belong_together() -> None:
@@ -186,13 +166,6 @@ def test_noise_of_commands_is_an_error_of_the_machine(
     drawn, found = replace(data, y=data.y + target - data.target), Selection(scales, "")
     variances = unresolved_errors(found, scales, drawn, len(x) - repeats, factor=4.0)
     assert (0.0 if variances is None else float(variances.max() / 4.0) ** 0.5) == pytest.approx(expected, rel=1e-3)
-
-
-def test_markers_and_repeats_of_a_row_count_as_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    shares = list[Tensor]()
-    monkeypatch.setattr(one_out, "region_scale", lambda *given: float(shares.append(given[2]) is None))
-    cross_validated_inflation(None, arm(2, 40).scales, arm(2, 40).tangent_data, torch.arange(40) // 2)
-    assert float(shares[0].sum()) == pytest.approx(20.0)
 
 
 def test_parts_of_the_space_show_errors_that_no_row_does() -> None:

@@ -1,7 +1,5 @@
 """Tools that take turns, payloads of other rows, and ratios of slides and mimic joints that a fit would take up."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Markers that are mounted anew between sessions of one measuring frame: found, fitted, judged, predicted, saved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +7,9 @@ import pytest
 import torch
 from product_bank import usual_scales
 from source_bank import remounted
-from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -83,22 +78,6 @@ def test_the_marker_of_each_session_is_predicted(result: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_marker_that_a_session_hides() -> None:
-    """It is where it was, and nothing is predicted of it there."""
-    arm = SimulatedArm(seed=1, markers=2)
-    rows = remounted(arm, dc.Measurements(*arm.measure(90, seed=1), arm.nominal.joint_names), SHIFTS)
-    points, names = rows.points.clone(), rows.device_names
-    points[[name == "c" for name in names], 1] = torch.nan
-    data = dc.Measurements(rows.q, points, arm.nominal.joint_names).with_sessions(names, remounted=True)
-    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal))
-    assert [text.partition(" away")[0].count("not seen") for text in found.placement.sentences()] == [0, 1]
-    (b, c) = found.model.predict_readings(rows.q[:3])
-    assert bool(b.mean.isfinite().all())
-    assert c.mean.isnan().view(3, 2, 3).any(2).any(0).tolist() == [False, True]
-    assert dc.evaluate(found.model, data).rms < 1e-4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("said", [False, True])
 def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None:
     """Frames are taken for markers, and markers for frames."""
@@ -113,17 +92,3 @@ def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None
     with pytest.warns(DiffeoCalibWarning) as caught:
         calibrated(data.with_sessions(names, remounted=said))
     assert sum("--remounted" in str(one.message) for one in caught) == 1
-
-
-def test_set_ups_are_named(tmp_path: Path) -> None:
-    path, columns = tmp_path / "t.csv", ["x", "y", "z"]
-    write_measurements(path, remounted(ARM, table(10, 1)), TableFormat("m", "rad"))
-    known: dict[str, Any] = {"length": "m", "angle": "rad", "remounted": True}
-    same = dc.read_measurements(path, ARM.nominal, columns, session="session", **known)
-    assert (same.remounted, same.session_names) == (True, ("a", "b", "c"))
-    q, poses = ARM.sample(6, seed=1), torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
-    posed = dc.Measurements.from_poses(q, poses, ARM.nominal.joint_names, doubt=False)
-    refused(
-        ("`remounted` without `session`", lambda: dc.read_measurements(path, ARM.nominal, columns, **known)),
-        ("expected positions, got poses", lambda: posed.with_sessions(list("aabbcc"), remounted=True)),
-    )

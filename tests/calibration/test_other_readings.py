@@ -16,6 +16,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
+    Reading,
     conventions_of,
     likely_mistake,
     other_columns,
@@ -122,7 +123,9 @@ def test_a_wrong_column(tmp_path: Path) -> None:
     names[1] = "load"
     read = read_table(path, names, XYZ, table, kinds=arm.nominal.kinds)
     right = [
-        one for one in other_columns(arm.nominal, read) if "'shoulder_joint' fits as shoulder_joint in pl" in one.words
+        one
+        for one in other_columns(Reading.of(arm.nominal, read), read)
+        if "'shoulder_joint' fits as shoulder_joint in pl" in one.words
     ]
     torch.testing.assert_close(right[0].q, data.q, rtol=1e-12, atol=1e-12)
     for changed in (lambda: path.write_text("another file\n"), path.unlink):

@@ -21,9 +21,9 @@ from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
-from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
-from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
+from diffeo_calib.calibration.diagnostics import judged_rows
+from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, block_text, contradicted, excluded, steps_of
+from diffeo_calib.calibration.diagnostics.likely_mistakes import out_of_step
 from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
@@ -208,7 +208,7 @@ def test_a_wrong_pose_is_named(posed: Case) -> None:
 )
 def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case) -> None:
     data = changed(arm, rows, ASIDE)
-    text = block_text(arm.model, data, contradicted(arm.model, data))
+    text = block_text(arm.model, data, judged_rows.flagged(len(data), contradicted(arm.model, data)))
     assert text.startswith(f"10 rows look wrong that follow one another: {words} a median error of 200 mm")
     assert "moving the measuring device by 200 mm" in text
 
@@ -217,15 +217,15 @@ def test_the_block_is_where_the_wrong_rows_are() -> None:
     """Random rows are rarely one."""
     generator = torch.Generator().manual_seed(1)
     for share in (0.02, 0.1, 0.3):
-        found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
+        found = [judged_rows.find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
         assert sum(place is not None for place in found) <= 2
     wrong = torch.zeros(100, dtype=torch.bool)
     wrong[40:50] = True
     wrong[[3, 77]] = True
-    assert find_block(wrong) == (40, 50)
+    assert judged_rows.find_block(wrong) == (40, 50)
     wrong[45] = False
-    assert find_block(wrong) == (40, 50)
-    assert find_block(~wrong) is None  # nearly all rows
+    assert judged_rows.find_block(wrong) == (40, 50)
+    assert judged_rows.find_block(~wrong) is None  # nearly all rows
 
 
 # --- wrong labels -----------------------------------------------------------------------------------------------------

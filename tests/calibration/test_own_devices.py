@@ -1,7 +1,5 @@
 """Kinds of devices from outside the package, those of scripts/examples, and a rigid tool held by two hands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import torch
 import two_arms_bank
 from inclinometer import Inclinometers
 from kind_bank import kind_named
-from laser_line import Beams, readings
+from laser_line import Beams
 from product_bank import simulated_poses, with_usual_scales
 from tangent_bank import normal
 from torch import Tensor
@@ -19,9 +17,6 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import KINDS, kind_of, register
@@ -33,9 +28,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning
 def registered() -> None:
     """The classes of these modules, also where another test ran an example as a program in this process."""
     KINDS.update({Beams.kind: Beams, Inclinometers.kind: Inclinometers})
-
-
-ARM = SimulatedArm(seed=0, markers=2)
 
 
 def test_an_inclinometer_finds_how_it_is_mounted_and_makes_the_model_better() -> None:
@@ -65,24 +57,6 @@ def test_a_frame_is_seen_beside_poses_only() -> None:
         dc.evaluate(kind_named("positions").model, seen)
 
 
-def test_written_and_read_in_its_own_unit(tmp_path: Path) -> None:
-    q = ARM.sample(8, seed=1)
-    names, table = ARM.nominal.joint_names, TableFormat("mm", "deg")
-    angles = 0.1 * torch.arange(16.0, dtype=torch.float64).view(8, 2)
-    turns = dc.Readings.of("tilt", q, angles, None, names, unit=("mrad", 1e3), std=1e-4, numbers=2)
-    beams = readings(ARM, q)
-    for data, cell in ((turns, "1500."), (beams, f"{1e3 * float(beams.values[0]):.6f}"[:-2])):
-        written = write_measurements(tmp_path / "t.csv", data, table)
-        assert cell in (tmp_path / "t.csv").read_text()
-        same: Any = read_observations(tmp_path / "t.csv", written)
-        assert (same.kind, same.unit, same.device_names) == (data.kind, data.unit, data.device_names)
-        assert_close(same.values, data.values, rtol=0, atol=1e-12)
-        assert (same.std is None) == (data.std is None)
-    assert list(turns.to_frame().columns)[6:8] == ["tilt 1", "tilt 2"]
-    with pytest.raises(MeasurementError, match=r"'tilt'.*register"):
-        dc.calibrate(ARM.nominal, dc.Readings.of("tilt", ARM.sample(60), 0.1, None, names))
-
-
 def test_kinds_are_registered_once() -> None:
     assert kind_of(dc.Readings.of("line distance", torch.zeros(3, 2), 1.0, doubt=False)) is Beams
     assert register(Beams) is Beams
@@ -94,8 +68,6 @@ def test_kinds_are_registered_once() -> None:
         register(other)
     assert KINDS["height"] is not other
 
-
-# --- a tool held by two hands, beside measured poses of both ----------------------------------------------------------
 
 AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
 ORIGINS = ("0 {side} 0.3", "0 0 0.2", "0 0 0.35", "0.3 0 0", "0.1 0 0", "0.1 0 0")

@@ -59,22 +59,6 @@ def test_sag_under_other_payloads_is_predicted(rows: dc.Measurements, result: An
     assert {part.name: part.displacement for part in result.parts}["payload"] > 1e-4
 
 
-def test_queries_of_a_laden_model_agree(result: Any, other: dc.Measurements) -> None:
-    """Values by NumPy and by torch, derivatives, covariances and compensation, under another payload."""
-    model, q = result.model.with_payload(7.5), other.q[:5]
-    assert model.payload == 7.5
-    assert result.model.payload == 4.0  # the median of the fit
-    torch.testing.assert_close(model(q), model(q.clone().requires_grad_()).detach(), rtol=0, atol=1e-12)
-    step = 1e-6 * torch.eye(6, dtype=torch.float64)
-    slopes = torch.stack([(model(q + h) - model(q - h)) / 2e-6 for h in step], -1)
-    torch.testing.assert_close(model.jacobian(q), slopes, rtol=0, atol=1e-7)
-    mean, covariance = model.predict(q)
-    torch.testing.assert_close(mean, model(q), rtol=0, atol=1e-12)
-    assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
-    found = dc.compensate(model, model.tool_poses(q), q + 1e-4)
-    torch.testing.assert_close(found.q, q, rtol=0, atol=1e-9)
-
-
 def test_predicted_deviations_hold(result: Any, other: dc.Measurements) -> None:
     inside = []
     for mass in (1.0, 6.0, 8.5):

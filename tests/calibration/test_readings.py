@@ -1,7 +1,5 @@
 """Calibration by distances, heights and images: start values, scales, the exact model, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

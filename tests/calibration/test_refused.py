@@ -1,7 +1,5 @@
 """Rows that cannot belong to the robot: refused if a mistake explains them, else calibrated with a warning."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -26,9 +24,6 @@ from diffeo_calib.robots import Joint, SimulatedArm
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
 ARM, ROWS, _ = simulated(30)
 ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
-
-
-# --- refused ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -73,9 +68,6 @@ def test_rows_that_cannot_be_those_of_the_robot_are_refused() -> None:
         (r"at least 3 poses, got .*measure more poses", calibrated(Q[:2], POINTS[:2])),
         (r"same configuration|does not move", calibrated(Q[:1].repeat(30, 1), POINTS[:1] + 1e-5 * normal(30, 1, 3))),
     )
-
-
-# --- doubtful rows ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:rail. never moved")

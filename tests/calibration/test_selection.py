@@ -1,12 +1,9 @@
 """Scales: defaults, the log posterior against scipy and formulas, the search; the rows that they are chosen for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +22,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.noise_model import differing_factor
-from diffeo_calib.calibration.scales.selection import defaults, log_posterior, select
+from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -35,8 +32,6 @@ from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
-
-# --- defaults ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
@@ -62,9 +57,6 @@ def test_the_unit_of_length_does_not_matter() -> None:
     assert_close(grown.rotation_noise, setting.scales.rotation_noise, rtol=1e-6, atol=0)
     assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude, rtol=1e-6, atol=0)
     assert bool((grown.joint_noise > 0).all())
-
-
-# --- log posterior ----------------------------------------------------------------------------------------------------
 
 
 def log_prior(scales: dc.Hyperparameters, centre: dc.Hyperparameters) -> float:
@@ -149,35 +141,6 @@ def test_gradient_against_central_differences(rows: Callable[[], tuple[dc.Hyperp
         assert float(found.gradient @ step) == pytest.approx(expected, rel=1e-4, abs=1e-6 * scale)
 
 
-def value(setting: Setting, scales: dc.Hyperparameters) -> float:
-    """Log posterior, up to a constant."""
-    found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)
-    return found.likelihood + found.prior
-
-
-def test_a_search_that_ends_early_keeps_the_best_so_far() -> None:
-    """First its start; the line search overshoots at times, and the scales that are kept never get worse."""
-    setting = built("two markers")
-    start, kept = shaken(setting.scales, 4), []
-    for calls in range(2, 10):
-        left = iter(range(calls - 1))
-
-        def progress(*_: object, left: Any = left) -> None:
-            if next(left, None) is None:
-                raise KeyboardInterrupt
-
-        found = select(setting.scales, setting.tangent_data, start=start, progress=progress)
-        assert found.interrupted
-        kept.append(value(setting, found.scales))
-    assert kept[0] == pytest.approx(value(setting, start), rel=1e-9)
-    assert kept == sorted(kept)
-    assert kept[-1] > kept[0] + 1.0
-    whole = select(setting.scales, setting.tangent_data, start=start)
-    assert value(setting, whole.scales) > kept[-1]
-    likelihood = log_posterior(whole.scales.logarithms(), setting.scales, setting.tangent_data).likelihood
-    assert f"likelihood {likelihood:.1f} on {len(setting.data)} poses" in whole.status
-
-
 @pytest.mark.slow
 def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     """Joints that do not repeat, a perfect tracker: s must be found, and nothing may be learnt from it."""
@@ -193,23 +156,6 @@ def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     seen = noise_blocks(scales, nominal, test.q).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
     assert float(seen) > 0.5 * float((test.points - arm.true_points(test.q)).norm(dim=-1).square().mean().sqrt())
     assert float(scales.joint_noise.max()) > 3e-5
-
-
-# --- rows around a geometric calibration ------------------------------------------------------------------------------
-
-
-def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
-    """Whatever was asked for before: other scales, other weights, other measurements, fewer rows."""
-    first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
-    kept, other = setting.tangent_data.with_tails(setting.tangent_data.tails), weighted(setting, 3)
-    kept.process(first)
-    some = kept.rows(torch.arange(3))
-    orders = [(kept.with_tails(other.tails), first), (kept, second), (kept, first), (some, first)]
-    for data, scales in [*orders, (replace(kept, y=kept.y + 1e-3), first)]:
-        assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
-
-
-# --- six numbers of a pose in place of nine coordinates ---------------------------------------------------------------
 
 
 def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
@@ -228,8 +174,6 @@ def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
     assert maps[0].slopes is None
     assert maps[0].noise.covariance.shape == (12, 9, 9)
 
-
-# --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
 

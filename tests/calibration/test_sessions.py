@@ -1,13 +1,11 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_bank import Command
 from product_bank import with_usual_scales
 from table_bank import refused
 from torch import Tensor
@@ -90,38 +88,3 @@ def test_rows_of_several_set_ups_are_not_compared_with_a_model(arm: SimulatedArm
         (r"the names of sessions: .* cannot be listed", lambda: data.with_sessions(torch.zeros(6, device="meta"))),
         (r"the names of sessions: 1 row\(s\)", lambda: data.with_sessions(["a", " ", "b", "b", "a", "a"])),
     )
-
-
-@pytest.fixture
-def table(arm: SimulatedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dc.Measurements:
-    """The rows of `campaign` as t.csv with the column `day`, and their robot, in the folder of the test."""
-    monkeypatch.chdir(tmp_path)
-    data = campaign(arm, shuffled=True)
-    header = [*arm.nominal.joint_names, "x", "y", "z", "u", "v", "w", "day"]
-    names = [data.session_names[k] for k in (data.session if data.session is not None else ())]
-    rows = [[*q, *p, name] for q, p, name in zip(data.q.tolist(), data.points.flatten(1).tolist(), names, strict=True)]
-    (tmp_path / "t.csv").write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]))
-    arm.write_urdf(tmp_path / "arm.urdf")
-    return data
-
-
-TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
-
-
-def other_names(text: str) -> str:
-    """A table whose sessions the model does not know."""
-    return re.sub("Monday|Tuesday|Friday", lambda found: f"new {found[0]}", text)
-
-
-def test_rows_of_other_sessions_in_one_frame_are_named(table: dc.Measurements, result: Any, command: Command) -> None:
-    dc.save(result.model, "m.safetensors")
-    done = command("evaluate", "m.safetensors", "t.csv", *TABLE)
-    assert "70 rows of the fit were measured in another set-up than that of the model" in " ".join(done.err.split())
-    assert "name the column of the set-ups (--session)" in " ".join(done.err.split())
-    lines = Path("t.csv").read_text().split("\n")
-    own = [line for line in lines[1:] if line.endswith(result.sessions.names[result.sessions.reference])]
-    Path("own.csv").write_text("\n".join([lines[0], *own]))
-    assert not command("evaluate", "m.safetensors", "own.csv", *TABLE).warnings
-    Path("few.csv").write_text(other_names("\n".join(lines[:5])))
-    few = command("evaluate", "m.safetensors", "few.csv", *TABLE, "--session", "day")
-    assert "expected 4 rows, got" in few.error

@@ -24,7 +24,7 @@ from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, l
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.sockets import SocketReadings
+from diffeo_calib.measurements.readings import SocketReadings
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
@@ -207,7 +207,7 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
         ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
         ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
-        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={PAIR: 0.0})),
+        ("the distance of .* expected a positive number in m", lambda: wrong(some, distances={PAIR: 0.0})),
         (f"{pair}, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
@@ -217,8 +217,8 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
         table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
-    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
-    assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
+    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
+    assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]
 
 
 def test_splits_hold_out_whole_places(some: SocketRows) -> None:

@@ -11,7 +11,7 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
+from diffeo_calib.common.errors import DiffeoCalibWarning
 
 pytestmark = pytest.mark.slow  # several calibrations
 
@@ -65,13 +65,6 @@ def test_the_weight_of_the_other_arm_counts(body: SimulatedUpperBody, data: dc.M
 def ignored_branches(body: SimulatedUpperBody) -> dc.Chain:
     with pytest.warns(DiffeoCalibWarning, match="their weight bends the robot"):
         return body.robot(HANDS[:1])
-
-
-def test_a_tool_needs_its_tip(model: dc.CalibratedKinematics, q: Tensor) -> None:
-    with pytest.raises(InputError, match=r"has several tips; name its `tip`.*model.with_tool\(tool, tip="):
-        model.tool_poses(q)
-    with pytest.raises(InputError, match=r"`tip`: expected one of .*, got 'tail'"):
-        model.tool_poses(q, tip="tail")
 
 
 def test_commands_of_one_arm_leave_the_other_alone(model: dc.CalibratedKinematics, q: Tensor) -> None:

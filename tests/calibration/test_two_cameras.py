@@ -149,7 +149,7 @@ def test_tables_of_several_cameras_that_cannot_be() -> None:
         ("given camera 'left'", lambda: of_corners(camera={"left": lens, "right": lens})),
         ("60", lambda: of_corners(seen_by=["left"] * 7)),
         ("cameras", lambda: dc.Measurements.joined([data(), of_corners()])),
-        (r"several cameras on the tool.*day 1", lambda: tool.with_sessions(days[: len(tool)])),
+        (r"several cameras on the tool.*no set-ups", lambda: tool.with_sessions(days[: len(tool)])),
         (r"'right'.*expected 4 rows, got 'right' in 3 rows", lambda: dc.calibrate(kind().robot, few)),
     )
 

@@ -1,7 +1,5 @@
 """Unusual data: other numbers of joints, repeats, known deviations, and markers that some rows hide."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from math import nan
@@ -126,9 +124,6 @@ def test_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert float((squares < 7.8147).double().mean()) > 0.9
 
 
-# --- hidden markers ---------------------------------------------------------------------------------------------------
-
-
 def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
     one = case("hidden markers")
     problem = robot_problem(one.data, one.scales)
@@ -173,7 +168,7 @@ def test_marker_that_no_row_shows_is_refused() -> None:
     q, points = arm.measure(20, seed=4)
     points[10:, 1] = nan
     data = dc.Measurements(q, points, arm.nominal.joint_names)
-    with pytest.raises(MeasurementError, match="marker 1 is hidden in all 10 rows"):
+    with pytest.raises(MeasurementError, match="marker 1: hidden in all 10 rows"):
         dc.calibrate(arm.nominal, data.rows(slice(10, None)))
     with pytest.raises(MeasurementError, match="never show marker 1"):
         register(arm.nominal, q[10:], points[10:])

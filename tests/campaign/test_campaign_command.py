@@ -1,7 +1,5 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import io
@@ -212,40 +210,6 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
         file.write(lines[21])
     assert command(*accepted, "--tolerance", "50mm").code == 0
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
-
-
-def test_rows_that_are_there_before_are_judged_as_with_once(
-    tmp_path: Path, lines: list[str], command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also without a row that comes later; a line that cannot be read is named by its place in the table.
-
-    No line can be read where a column is missing: the campaign ends, and the journal says nothing.
-    """
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
-    wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
-    (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--position", "x,y,w")
-    assert done.code == 1
-    assert "run.csv', header: no column ['w']" in done.error
-    assert (tmp_path / "run.csv.journal").read_bytes() == b""
-    done = command("campaign", tmp_path / "campaign.toml", "--once", "--length", "m")
-    assert any(f"file '{tmp_path / 'run.csv'}': " in text for text in done.warnings)  # 1000 m
-    (tmp_path / "run.csv.journal").unlink()
-    accepted = []
-    goal = '"error_limit_mm": null, "more_rows": '
-    for how, known in (  # the last one answers in JSON
-        (["--once"], "mm expected"),
-        (["--stdin", "--tolerance", "1um"], goal),
-        (["--stdin"], '"expected_error_mm": 0.'),
-    ):
-        done = command("campaign", tmp_path / "campaign.toml", *how, "--accepted", tmp_path / "accepted.csv")
-        assert done.code == (4 if known == goal else 0)
-        for words in ("row 15 looks wrong", known, "run.csv', line 17"):
-            assert words in done.out
-        assert (goal in done.out) == (known == goal)
-        accepted.append((tmp_path / "accepted.csv").read_text())
-        (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1] == accepted[2] == "".join([*lines[:14], lines[14]])
 
 
 @pytest.mark.slow

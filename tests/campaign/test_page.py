@@ -1,7 +1,5 @@
 """The page of a campaign: who may see it, what comes when, and in a real browser what is drawn and what buttons do."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import socket

@@ -1,9 +1,7 @@
 """The command line in this process, and one robot with its table and its fitted model for all files."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,6 @@ import pytest
 from command_bank import NOTE, Command, Outcome, Site, make_site, run_process
 from commanded_bank import write_columns
 from init_bank import ARM, NAMES, ROWS, Proposed
-from server_bank import Server
 from shared_bank import shared
 from torch import Tensor
 
@@ -69,13 +66,6 @@ def sound(small_site: Site) -> bytes:
 
     path.write_bytes(shared("sound site", make))
     return path.read_bytes()
-
-
-@pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Commands in processes of their own."""
-    with Server(tmp_path_factory.mktemp("printed")) as running:
-        yield running
 
 
 @pytest.fixture(scope="session")

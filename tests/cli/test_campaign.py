@@ -1,7 +1,5 @@
 """Campaign files: options written once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,13 +1,10 @@
 """What `init` reads in the names of columns, as devices and programs write them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 import pytest
 
-from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import Body, bodies_in, guess_deviations, guess_joints, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
@@ -114,24 +111,6 @@ def test_which_columns_are_the_joints() -> None:
     assert not guess_joints(names, ARM)
     assert joints_without_column(names, ARM) == ["forearm"]
     assert guess_joints([*names, "E1"], ARM)[0].names[3] == "E1"
-
-
-@pytest.mark.parametrize(
-    ("name", "words", "unit"),
-    [
-        ("Wrist 1 [deg]", ("wrist", "1"), "deg"),
-        ("POSX_mm", ("pos", "x"), "mm"),
-        ("joint_deg_1", ("joint", "1"), "deg"),
-        ("b_m_x", ("b", "m", "x"), ""),
-        ("cam tvec[2]", ("cam", "tvec", "z"), ""),
-        ("current_joint_1", ("actual", "joint", "1"), ""),
-        ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
-        ("关节1(度)", ("关节", "1"), "deg"),
-        ("X坐标(毫米)", ("x", "坐标"), "mm"),
-    ],
-)
-def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:
-    assert (column(name).words, column(name).unit) == (words, unit)
 
 
 def test_deviations_are_named_as_what_they_are_of() -> None:

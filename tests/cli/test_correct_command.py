@@ -1,7 +1,5 @@
 """`diffeo-calib correct`: programs of commands and of targets, read back and checked against the model."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -192,8 +190,6 @@ def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -
     torch.testing.assert_close(model.tool_poses(after, tool)[reached], expected, rtol=0, atol=1e-8)
 
 
-# --- several tools ---
-
 UNITS_OF_HANDS = ["--length", "mm", "--angle", "rad", "--limit", 20.0]
 TOOLS = [*(word for hand in HANDS for word in ("--tip", hand)), "--tool", "0,0,100", "--tool", "20,50,0"]
 PLACES = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -234,8 +230,6 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
         np.testing.assert_allclose(found, own.numpy(), rtol=1e-9, atol=1e-9)
 
 
-# --- what is refused ---
-
 BOTH = ["--tip", "left", "--tip", "right"]
 
 
@@ -244,15 +238,12 @@ BOTH = ["--tip", "left", "--tip", "right"]
     ("options", "message"),
     [
         (["--tool", "1,2"], "--tool 1,2: expected X,Y,Z, or 6 numbers with the rotation as 'rotvec'"),
-        (["--tool", "1,2,x"], "--tool 1,2,x: expected X,Y,Z"),
         (["--tool", "1,2,3,1,1,1,1", "--convention", "quat_xyzw"], "--tool: expected a quaternion of length 1"),
         (["--tool", "0,0,3000"], "warning: --tool is 3 m long, more than the robot reaches"),
         (["--tool", "0,0,150", "--length", "m"], "error: --tool is 150 m long, more than the robot reaches"),
-        (["--tool", "0,0,1e30"], "more than the robot reaches"),
         (["--tool", "measured:0,0,0.1"], "calibrated with points, which have no measured frame"),
         (["--frame", "measuring"], "--frame measuring: the nominal poses of commands are in the robot's base"),
         (["--limit", "0"], "--limit: expected a number above 0"),
-        (["--rate", "-1"], "--rate: expected a number above 0"),
         (["--rotation", "a,b,c"], "--rotation without --position"),
         (["--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--tip", "left", "--tip", "left"], "--tip left is named twice"),

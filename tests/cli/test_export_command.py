@@ -1,7 +1,5 @@
 """`diffeo-calib export`: files that agree with the Python functions, and the accuracy that each keeps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`diffeo-calib fit`: what it prints and writes; `demo`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -3,23 +3,19 @@
 What a terminal shows of names and cells, short and without control characters; the progress line.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
-import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from command_bank import Command, Site, edited, environment, run_process, set_cell
+from command_bank import Command, Site, edited, run_process, set_cell
 
 import diffeo_calib as dc
 from diffeo_calib.cli import console
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.declarations import COMMANDS
-from diffeo_calib.common.errors import LONGEST_NAME, InputError, few, listed, printable, sentence, shown
+from diffeo_calib.common.errors import few, listed, printable, sentence
 
 OPTIONS = {
     name: ["--json", *(word for one in options.all() for word in one.names or (one.shown,))]
@@ -78,11 +74,6 @@ def test_former_names_say_what_to_do(former: str, advice: str, command: Command)
     assert advice in command(*former.split()).err
 
 
-def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, command: Command) -> None:
-    (tmp_path / "c.toml").write_text('csv = "t.csv"\npayload_mass = 3\n')
-    assert "--payload-mass is gone; write --payload." in command("fit", tmp_path / "c.toml").err
-
-
 SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors", "llvmlite")
 LIGHT = f"""
 import atexit, sys
@@ -120,19 +111,6 @@ def test_completion_loads_nothing_slow(words: str, expected: list[str]) -> None:
     assert done.out.split() == expected
 
 
-def test_the_script_of_the_completion_asks_the_program(tmp_path: Path) -> None:
-    variables = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = run_process("--show-completion", "bash", variables=variables)
-    assert done.code == 0
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in done.out
-    assert re.search(r"^complete .*-F \w+ diffeo-calib$", done.out, re.MULTILINE)
-    done = run_process("--install-completion", "bash", variables={**variables, "HOME": str(tmp_path)})
-    assert done.code == 0
-    (script,) = (tmp_path / ".bash_completions").iterdir()
-    assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in script.read_text()
-    assert str(script) in (tmp_path / ".bashrc").read_text()
-
-
 def test_the_module_is_the_program() -> None:
     done = run_process("-h", program=("-m", "diffeo_calib"))
     assert done.code == 0
@@ -147,24 +125,6 @@ def test_the_console_script_points_into_the_package() -> None:
     assert found is not None
     assert callable(getattr(importlib.import_module(found[1]), found[2]))
     assert version("diffeo_calib") == dc.__version__
-
-
-@pytest.mark.parametrize(
-    ("output", "message"), [("none/model", "make its folder first"), ("model", "no file t.csv; check")]
-)
-def test_errors_before_the_work_load_no_torch(output: str, message: str, tmp_path: Path) -> None:
-    fit = ["fit", "t.csv", "--robot", "r.urdf", "--base", "a", "--tip", "b", "--position", "x,y,z"]
-    units = ["--length", "m", "--angle", "rad", "-o", str(tmp_path / output)]
-    command = [sys.executable, "-c", LIGHT, *fit, *units]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=60, check=False, encoding="utf-8")
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert "torch" not in done.stderr.splitlines()[-1]
-
-
-def test_evaluate_loads_nothing_that_draws() -> None:
-    program = "import sys, diffeo_calib.cli.commands.evaluate; print('matplotlib' in sys.modules)"
-    assert run_process(program=("-c", program)).out == "False\n"
 
 
 ESCAPE = "\x1b[31mred\x07"
@@ -182,14 +142,6 @@ def test_control_characters_are_escaped_everywhere() -> None:
     assert printable("a\u202eb\udcff\x00") == "a\\u202eb\\udcff\\x00"
     assert printable("Gelenk 1, \u03b1 \u95a2\u7bc0") == "Gelenk 1, \u03b1 \u95a2\u7bc0"
     assert plain("two\nlines") == "two\nlines"
-
-
-def test_long_values_are_cut_in_the_middle() -> None:
-    assert len(shown("x" * 100_000)) <= LONGEST_NAME
-    assert shown("short") == "short"
-    assert shown("begin" + "x" * 1000 + "end").startswith("begin")
-    assert shown("begin" + "x" * 1000 + "end").endswith("end")
-    assert len(str(InputError.of("w" * 10**5, expected="e" * 10**5, got="g" * 10**5, fix="f" * 10**5))) < 6000
 
 
 @pytest.mark.parametrize("text", [ESCAPE, "x" * 100_000])

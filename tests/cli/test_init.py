@@ -1,7 +1,5 @@
 """`init`: which robot, link, columns, units and conventions it proposes, and what `fit` says of the same."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -137,25 +135,6 @@ def test_the_convention_that_explains_the_rows(
     assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons(text)["robot"]
     fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *GIVEN, "-o", tmp_path / "m")
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
-
-
-def test_a_last_row_without_a_joint_and_options_that_do_not_belong(
-    tmp_path: Path, command: Command, proposed: Proposed
-) -> None:
-    """The row of a flange has no column; the tip is before it."""
-    q, points = write_dh_arm(tmp_path, "standard", 1.0, "joint_{}")
-    with (tmp_path / "arm.csv").open("a") as file:
-        file.write("\n0,0.05,0,0\n# standard")
-    entries, _ = proposed(([f"joint_{k}" for k in range(1, 7)], q), (XYZ, points), robot="arm.csv")
-    assert (entries["tip"], "dh-convention" in entries) == ("joint_6", False)
-    words = ["fit", tmp_path / "t.csv", *GIVEN, "-o", tmp_path / "m"]
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    for robot, option, message in (
-        ("arm.csv", ["--base", "link"], "--base or --load of a DH table"),
-        ("arm.csv", ["--tip", "flange"], "expected one of joint_1, joint_2"),
-        ("arm.urdf", ["--dh-convention", "craig"], "--dh-convention of a URDF"),
-    ):
-        assert message in command(*words, "--robot", tmp_path / robot, *option).error
 
 
 # --- columns whose names leave something open ---
@@ -301,22 +280,6 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     q[:, 2] *= -1
     found, _ = proposed((["up", "one [rad]", "two [rad]"], q), (XYZ, points))
     assert found["joints"] == "up,one [rad],-{two [rad]}"
-
-
-@pytest.mark.parametrize(("length", "per_metre"), [("m", 1.0), ("mm", 1e3)])
-def test_the_size_of_a_gantry_follows_from_its_limits(
-    length: str, per_metre: float, tmp_path: Path, proposed: Proposed
-) -> None:
-    link = '<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>'
-    link += '<limit lower="0" upper="1" effort="1" velocity="1"/></joint><link name="{2}"/>'
-    axes = ("x1", "a", "b", "1 0 0"), ("y1", "b", "c", "0 1 0"), ("z1", "c", "d", "0 0 1")
-    text = f'<robot name="g"><link name="a"/>{"".join(link.format(*axis) for axis in axes)}</robot>'
-    (tmp_path / "arm.urdf").write_text(text)
-    found, text = proposed((["x1", "y1", "z1"], per_metre * UNIT), (XYZ, per_metre * (0.999 * UNIT + 0.3)))
-    assert found["length"] == length
-    assert "limits of the joints" in text
-    found, text = proposed((["x1", "y1", "z1"], per_metre * UNIT), (XYZ, noise(30, 3, size=per_metre)))
-    assert (found, "one clear reading" in text) == ({}, True)
 
 
 @pytest.mark.slow

@@ -1,20 +1,16 @@
 """`init`: sockets, rotations, deviations, wires, payloads and cameras of a table."""
 
-from __future__ import annotations
-
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from command_bank import Command
-from init_bank import ARM, ROWS, XYZ, Proposed, reasons, write_socket_table, write_wire_table
+from init_bank import ARM, ROWS, XYZ, Proposed, write_socket_table, write_wire_table
 from kind_bank import kind_named
 from product_bank import simulated_poses
 
 import diffeo_calib as dc
-from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.cli.main import expanded
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -136,22 +132,6 @@ def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
         expected = [True] if option == "camera-on-tool" else values
         assert written[option] == (expected if len(expected) > 1 or option == "position" else expected[0]), option
     assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
-
-
-@pytest.mark.slow
-def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
-    """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
-    kind = kind_named("images of a board")
-    table, _ = kind.table("new")
-    (tmp_path / "sub").mkdir()
-    shutil.copy(table, tmp_path / "corners.csv")
-    (tmp_path / "launch.yaml").write_text("camera: none\n")
-    (tmp_path / "wrist.yaml").write_text(camera_text(next(iter(kind.data.cameras.values()))))
-    done = command("init", tmp_path / "corners.csv", kind.urdf, "-o", tmp_path / "sub" / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "sub" / "c.toml").read_text()
-    assert 'reading = "corners=../wrist.yaml"' in text
-    assert "the file beside the table" in reasons(text)["reading"]
 
 
 def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command, init: Proposed) -> None:

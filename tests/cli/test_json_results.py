@@ -1,7 +1,5 @@
 """--json: the results of every command for programs, as the schema describes them."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path
@@ -76,13 +74,3 @@ def test_an_earlier_result_is_not_mistaken_for_this_one(
 
 
 STALE = '{"format": "diffeo_calib result", "exit_code": 0}'
-
-
-def test_other_files_and_questions_remove_nothing(folder: Path, command: Command) -> None:
-    other, out = folder / "other.json", folder / "out.json"
-    other.write_text('{"mine": 1}', encoding="utf-8")
-    out.write_text(STALE, encoding="utf-8")
-    assert command("predict", "--json", other, "--no-such-option").code == 2
-    assert command("predict", "--json", out, "--help").code == 0
-    assert other.read_text(encoding="utf-8") == '{"mine": 1}'
-    assert out.exists()

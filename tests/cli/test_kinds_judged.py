@@ -1,7 +1,5 @@
 """Residuals of tables of every kind, and the pictures of their reports."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

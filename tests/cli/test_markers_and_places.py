@@ -1,7 +1,5 @@
 """Tables whose lines name their marker, and measured places in a file of their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,10 +7,9 @@ from typing import Any, NamedTuple
 import pytest
 from command_bank import Command
 
-from diffeo_calib.cli.guesses import with_places
-from diffeo_calib.cli.options import Places, Rows
+from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import as_at_the_fit
-from diffeo_calib.measurements.csv.lines import read_cells, write_rows
+from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -73,32 +70,6 @@ def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, in
         assert words in text
     done = command("fit", tmp_path / "c.toml", "--position", "x")
     assert "--position: expected three names of columns" in done.error
-
-
-@pytest.mark.parametrize(
-    ("joints", "places", "by"),
-    [
-        ("time,robot,pose,a\n0.5,R1,7,1\n1.5,R1,8,2\n", "pose;time;robot;x\n8;0.4;R1;1\n7;1.6;R1;2\n", "pose"),
-        ("pose,a\nP1,1\nP2,2\nP3,4\n", "Name;x\nP3;1\nP1;2\nP2;3\n", "pose=Name"),
-    ],
-)
-def test_init_joins_by_columns_that_name_the_same_rows(joints: str, places: str, by: str, tmp_path: Path) -> None:
-    """The most common texts, or those of columns of other names."""
-    (tmp_path / "j.csv").write_text(joints)
-    (tmp_path / "p.csv").write_text(places)
-    path, common = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"))
-    assert common == by
-    assert [own[0] for _, own in read_cells(path, ",")[1]] == (["1.5", "0.5"] if by == "pose" else ["P3", "P1", "P2"])
-
-
-def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.joints, files.urdf, "-o", tmp_path / "c.toml")
-    assert "if they are in another file: --places FILE --by name;" in done.error
-    done = command("init", files.joints, files.urdf, "--places", files.whole, "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have" not in done.error
-    (tmp_path / "p.csv").write_text("x,y,z\n1,2,3\n")
-    done = command("init", files.joints, files.urdf, "--places", tmp_path / "p.csv", "-o", tmp_path / "c.toml")
-    assert "--places without --by: expected a column that both files have, got name, " in done.error
 
 
 @pytest.mark.parametrize(

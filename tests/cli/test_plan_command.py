@@ -1,7 +1,5 @@
 """`diffeo-calib plan`: first poses, next poses and poses to measure again, as tables that `fit` reads."""
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import replace
@@ -76,13 +74,10 @@ def test_next_poses_and_poses_to_measure_again(
     [
         ([], "what to plan for: expected a MODEL, or --robot, got neither"),
         (["MODEL", "--base", "x"], "--base beside MODEL"),
-        (["MODEL", "--marker", "0,0,1"], "--marker beside MODEL"),
         (["ROBOT", "--free", "base"], "--free without MODEL"),
         (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 or 6 or 7 numbers"),
-        (["ROBOT", "--column", "1,2"], "--column 1,2: expected 3 or 4 numbers"),
         (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
         (["ROBOT", "--candidates", "CSV", "--draw", "9"], "--draw beside --candidates"),
-        (["ROBOT", "--candidates", "CSV", "--collisions"], "--collisions beside --candidates"),
         (["ROBOT", "--candidates", "CSV", "-n", "99"], "at most 30, got 99"),
         (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
     ],

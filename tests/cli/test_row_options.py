@@ -1,9 +1,6 @@
 """Balls in sockets, readings, payloads, and rows of several kinds on the command line, and what is refused."""
 
-from __future__ import annotations
-
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -97,8 +94,6 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
-        (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
-        (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),
@@ -145,28 +140,6 @@ def mixed(mixtures: Path) -> Path:
     rows = dc.read_measurements(mixtures / "t.csv", robot, ["x", "y", "z"], **columns, length="mm", angle="rad")
     dc.save(with_usual_scales(robot, rows).model, mixtures / "mixed.safetensors")
     return mixtures / "mixed.safetensors"
-
-
-def test_other_commands_name_the_ball_and_what_was_measured(mixed: Path, command: Command, tmp_path: Path) -> None:
-    table, out, model = mixed.with_name("t.csv"), tmp_path / "o.csv", dc.load(mixed)
-    assert isinstance(model, dc.CalibratedKinematics)
-    assert command("predict", mixed, table, *RAD, "-o", tmp_path / "p.csv").code == 0
-    header = (tmp_path / "p.csv").read_text().splitlines()[0].split(",")[6:]
-    prefixes = ("marker_", "ball_")
-    assert header == [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    places = [f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"]
-    assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
-    planned = command("plan", mixed, "-n", 3, "--draw", 20, *RAD, "-o", out)
-    assert planned.code == 0, planned.err
-    assert out.read_text().splitlines()[0].endswith(",rank,device")
-    assert "spot 1/a: " in planned.out
-    assert "held out" not in planned.out
-    corrected = command("correct", mixed, tmp_path / "p.csv", *RAD, "-o", out)
-    assert corrected.code == 0, corrected.err
-    text = " ".join(corrected.out.split())
-    said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
-    assert said is not None
-    assert 0 < float(said[2]) < 0.5 * float(said[1])
 
 
 def test_set_ups_are_evaluated_each_in_its_place(mixed: Path, command: Command, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Commands with a model read a table as that of the model's fit; options that are typed win."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

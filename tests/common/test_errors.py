@@ -1,7 +1,5 @@
 """The grammar of messages, and where warnings point."""
 
-from __future__ import annotations
-
 import pytest
 
 import diffeo_calib as dc

@@ -1,7 +1,5 @@
 """Files that are written whole or not at all."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal
@@ -168,16 +166,3 @@ def test_places_that_cannot_be_written(place: str, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"cannot be written \(.+\); "):
             action(tmp_path / place)
     assert names(tmp_path) == before
-
-
-def test_the_check_changes_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"old")
-    (tmp_path / "new").symlink_to("b")
-    os.mkfifo(tmp_path / "pipe")
-    for name in ("a", "new", "pipe", "c"):
-        check_writable(tmp_path / name)  # a pipe without a reader is not waited for
-    assert names(tmp_path) == ["a", "new", "pipe"]
-    assert (tmp_path / "a").read_bytes() == b"old"
-    write_whole("/dev/null", b"content")
-    with pytest.raises(InputError, match="No space left on device"):
-        write_whole("/dev/full", b"content")

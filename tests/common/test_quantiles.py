@@ -1,7 +1,5 @@
 """Quantiles are those of scipy.stats, which is not imported for them; statistics leave missing values out."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from math import inf, nan

@@ -4,8 +4,6 @@ On the second device every operation fails that mixes its tensors with the CPU's
 by bit: nothing makes a tensor on a device that it did not state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

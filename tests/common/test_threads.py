@@ -1,7 +1,5 @@
 """Small work runs on one thread, large work on those that the user allows, and every setting is restored afterwards."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -37,9 +35,6 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
             assert torch.get_num_threads() == kept
         assert counts() == before
     assert 2 in before
-
-
-# --- torch -------------------------------------------------------------------------------------------------------
 
 
 def test_small_work_has_one_thread_and_large_work_inside_has_all() -> None:

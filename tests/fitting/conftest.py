@@ -1,7 +1,5 @@
 """Fits that several files use."""
 
-from __future__ import annotations
-
 import pytest
 from math_bank import rr_problem
 

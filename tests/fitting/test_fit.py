@@ -1,7 +1,5 @@
 """The arguments of `fit`: solvers, integrators, backends, fewer control points, and what it refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from math import nan
@@ -85,7 +83,6 @@ WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
         lambda p: dc.fit(p, dc.LBFGS),  # pyright: ignore[reportArgumentType]
         r"`solver`: expected dc.GaussNewton\(\), dc.LBFGS\(\) or dc.GradientDescent\(step\)",
     ),
-    "solver name": (lambda p: dc.fit(p, "lbfgs"), "`solver`: expected .*got 'lbfgs'"),  # pyright: ignore[reportArgumentType]
     "integrator name": (lambda p: dc.fit(p, integrator="rk4"), "`integrator`: expected .*got 'rk4'"),  # pyright: ignore[reportArgumentType]
     "integrator class": (lambda p: dc.fit(p, dc.LBFGS(integrator=dc.RK4)), "`integrator`: expected"),  # pyright: ignore[reportArgumentType]
     "start": (lambda p: dc.fit(p, start=p), "`start`: expected momenta, got Problem; pass `fit.momenta`"),  # pyright: ignore[reportArgumentType]
@@ -95,7 +92,6 @@ WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
     ),
     "start's size": (lambda p: dc.fit(p, controls=20, start=p.zero()), r"`start`: expected shapes .*\(20, 2\).*25"),
     "iterations": (lambda p: dc.GaussNewton(max_iterations=-1), "`max_iterations`: expected an integer of at least 1"),
-    "broken iterations": (lambda p: dc.LBFGS(max_iterations=1.5), "`max_iterations`: expected an integer"),  # pyright: ignore[reportArgumentType]
     "tolerance": (lambda p: dc.GaussNewton(tolerance=nan), "`tolerance`: expected a number above"),
     "no history": (lambda p: dc.LBFGS(history_size=0), "`history_size`: expected an integer of at least 1"),
     "preconditioned": (lambda p: dc.LBFGS(preconditioned="x"), "`preconditioned`: expected True or False"),  # pyright: ignore[reportArgumentType]
@@ -124,9 +120,6 @@ def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
     stopped = dc.fit(rr_problem(4, noise=0.1), dc.LBFGS(max_iterations=5))
     assert "limit of 5 iterations" in stopped.status
     assert stopped.integrator.intervals <= 2, "before the optimum, the end residual does not measure the time steps"
-
-
-# --- fits with fewer control points than measurements ---------------------------------------------------------------
 
 
 @pytest.mark.slow

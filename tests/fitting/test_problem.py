@@ -1,7 +1,5 @@
 """The energy (16), its certificates, functionals of k1 as measurements, and the input that problems refuse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path

@@ -150,9 +150,6 @@ def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LB
         assert not dc.fit(problem, solver, integrator, start=random_start(problem, 100.0)).converged
 
 
-# --- L-BFGS --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     problem = few_points()
@@ -164,9 +161,6 @@ def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     other = dc.fit(problem, dc.GaussNewton(), dc.RK4(1))
     assert fit.energy == pytest.approx(other.energy, rel=1e-9)
     torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
-
-
-# --- Mixed steps ---------------------------------------------------------------------------------------------------
 
 
 def momenta(task: Tensor) -> Momenta:

@@ -25,9 +25,6 @@ def flow_of(case: Case, integrator: Integrator, size: float = 0.3, *, variationa
     return Flow(case.kernel, q, a, integrator, variational=variational)
 
 
-# --- controls -------------------------------------------------------------------------------------------------------
-
-
 @every_case
 def test_energy_and_its_gradient(case: Case) -> None:
     q, a = start(case, 1.0).unbind(0)
@@ -81,9 +78,6 @@ def test_nodes_and_discrete_adjoint_are_those_of_the_naive_integration(case: Cas
     ):
         found.append(torch.autograd.grad((weight * end + 0.5 * end**2).sum(), live)[0])
     torch.testing.assert_close(*found, rtol=1e-12, atol=1e-12)
-
-
-# --- passive points -------------------------------------------------------------------------------------------------
 
 
 @every_case

@@ -1,7 +1,5 @@
 """Time stepping, ours and torchdiffeq's: orders of convergence, tolerances, quadrature, gradients, mistakes."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 
@@ -45,9 +43,6 @@ def loss(integrator: Integrator, at: Tensor) -> Tensor:
 def gradient(integrator: Integrator) -> Tensor:
     live = START.clone().requires_grad_()
     return torch.autograd.grad(loss(integrator, live), live)[0]
-
-
-# --- values ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -116,9 +111,6 @@ def test_refined_tightens_everything() -> None:
     assert (finest.rtol, finest.atol) == (1e-13, 1e-16)  # as far as rounding allows
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("method", FIXED)
 def test_backpropagation_is_the_exact_gradient_of_the_discrete_run(method: str) -> None:
     integrator = TorchDiffEq(method)
@@ -158,8 +150,6 @@ def test_passive_points_and_their_jacobians(method: str, close: float, own: floa
     torch.testing.assert_close(flow(x), y, rtol=0, atol=own)
     torch.testing.assert_close(jacobian, rows_jacobian(flow, x), rtol=0, atol=own)
 
-
-# --- mistakes -------------------------------------------------------------------------------------------------------
 
 BAD: list[tuple[type[Integrator], dict[str, Any], str]] = [
     *((RK4, {"steps": steps}, "`steps` of RK4: expected an integer of at least 1.*") for steps in (0, 1.5, "2", None)),

@@ -3,8 +3,6 @@
 After a change that is meant to change numbers: ``python tests/golden/write.py``, and say why in the commit.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 import write as golden_file

@@ -9,8 +9,6 @@ their last digit, and at least 1e-9.
     python tests/golden/write.py --keep           new numbers of this machine; tolerances as in the file
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -121,9 +119,6 @@ def upwards(value: float) -> float:
     """Rounded up to one digit."""
     unit = 10.0 ** floor(log10(value))
     return float(f"{ceil(value / unit - 1e-9) * unit:.0e}")
-
-
-# --- numbers of a calibration -----------------------------------------------------------------------------------------
 
 
 def computed(name: str, shake: int | None = None) -> dict[str, Entry]:

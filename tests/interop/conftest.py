@@ -1,7 +1,5 @@
 """A small model and its file, shared by the tests of model files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

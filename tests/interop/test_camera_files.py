@@ -1,7 +1,5 @@
 """The camera of a model in files of other programs: read back, they are its lens and its place, and these are true."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace

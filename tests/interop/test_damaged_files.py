@@ -1,7 +1,5 @@
 """Damaged and edited model files, files of other kinds, failing saves: each is refused with one clear sentence."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
@@ -110,28 +108,20 @@ def test_an_edit_needs_a_new_checksum(editor: Editor) -> None:
 
 WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "other format": (("format",), 1, "format version 1: expected 3; read it with the version that wrote it"),
-    "the format before": (("format",), 2, "format version 2: expected 3; read it with the version that wrote it"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
     "kernel option": (("joint_kernel", 0, "surprise"), 1, "do not fit together"),
     "no kernel": (("task_kernel",), [], "do not fit together"),
-    "kernel is a word": (("task_kernel",), "gaussian", "do not fit together"),
     "negative length": (("joint_kernel", 0, "lengthscale"), -1.0, "positive"),
-    "negative variance": (("task_kernel", 0, "variance"), -1.0, "non-negative"),
     "kernel of another joint": (("joint_kernel", 0, "columns"), [6], "6 coordinates"),
     "no steps": (("integrator", "steps"), 0, "at least 1"),
-    "too many steps": (("integrator", "steps"), 2000, "at most 1024"),
     "unknown integrator": (("integrator", "kind"), "euler", "euler"),
-    "dimension of a word": (("task_dim",), "three", "do not fit together"),
     "dimension of the plane": (("task_dim",), 2, "task_dim"),
     "integrator is true": (("integrator",), True, "do not fit together"),
     "lever of a model of points": (("lever",), 0.1, "a model of poses: expected three points for each, got 1"),
     "negative lever": (("lever",), -0.1, "`lever`"),
-    "lever is true": (("lever",), True, "`lever`"),
     "other kind": (("nominal", "kind"), "planet", "robot or function"),
-    "no robot": (("nominal",), None, "do not fit together"),
     "no joints": (("nominal", "joints"), [], "no moving joint"),
-    "joints of words": (("nominal", "joints"), "six", "do not fit together"),
     "axis of length zero": (("nominal", "joints", 0, "axis"), [0, 0, 0], "axis of joint 'waist_joint'"),
     "origin not rigid": (("nominal", "joints", 0, "origin"), np.diag([2.0, 1, 1, 1]).tolist(), "rigid"),
     "unknown joint": (("nominal", "joints", 0, "kind"), "ball", "kind of joint"),
@@ -140,14 +130,10 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "one active joint less": (("nominal", "joints", 1, "mimic"), {"waist_joint": 1.0}, "must have shape (N, 5)"),
     "elastic of a word": (("nominal", "elastic"), "no", "the entry elastic: expected true or false, got no"),
     "command of a number": (("provenance", "command"), 5, "the entry 'command' is 5"),
-    "note of a list": (("provenance", "note"), ["x"], "the entry 'note' is ['x']"),
-    "error of a word": (("report", "geometry rms [m]"), "large", "the entry 'geometry_rms' is 'large'"),
-    "part of a list": (("report", "geometry [m]"), [], "the entry 'geometry [m]' is []"),
     "urdf of a list": (("urdf",), ["<robot/>"], "the entry urdf: expected the text of a file, got list"),
     "negative payload": (("nominal", "payload"), {"mass": -1.0, "unit": 2.0}, "mass of the payload: expected a number"),
     "wave of no joint": (("nominal", "waves"), [[6, 3.0]], "gear waves: expected joints below 6, positive frequencies"),
     "axis of many terms": (("nominal", "axes"), [[0, -1.0, 1.0, 10**9]], "errors of axes: expected joints below 6"),
-    "rows of a truth value": (("report", "rows"), True, "the entry 'rows' is True"),
     "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
 }
 
@@ -178,24 +164,15 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "base not rigid": ("base", lambda t: -t),
     "base of another shape": ("base", lambda t: t[:3]),
     "no markers": ("tool", lambda t: t[:0]),
-    "markers not finite": ("tool", lambda t: t * float("nan")),
     "one joint error less": ("joint_errors", lambda t: t[:-1]),
-    "one parameter less": ("theta", lambda t: t[:-1]),
     "configurations not finite": ("x", lambda t: t * float("nan")),
     "noise negative": ("noise", lambda t: -t),
     "new noise negative": ("new_noise", lambda t: -t),
-    "new noise of nothing": ("new_noise", lambda t: 0 * t),
     "new noise not symmetric": ("new_noise", lambda t: t + 0.1 * t.max() * torch.ones_like(t).triu(1)),
-    "new noise not finite": ("new_noise", lambda t: t * float("inf")),
     "new noise of another size": ("new_noise", lambda t: t[:2, :2]),
-    "new noise of one number": ("new_noise", lambda t: t[0, 0]),
-    "new noise in single precision": ("new_noise", lambda t: t.float()),
     "one elastic prior less": ("prior_variance", lambda t: t[:-1]),
-    "one elastic prior nothing": ("prior_variance", lambda t: t * (torch.arange(len(t)) < len(t) - 1)),
     "one row less in x": ("x", lambda t: t[:-1]),
-    "one row less in p": ("momenta_y", lambda t: t[:-1]),
     "one row less in the noise": ("noise", lambda t: t[:-1]),
-    "prior negative": ("prior_variance", lambda t: -t),
     "parameters of a million metres": ("theta", lambda t: t + 2e6),
     "rigid errors of other joints": ("rigid_errors", lambda t: t[:2]),
     "rigid errors not rigid": ("rigid_errors", lambda t: 2 * t),

@@ -3,8 +3,6 @@
 The kinematics file of Universal Robots' packages: by their formula it gives the poses of the geometry.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re
@@ -21,7 +19,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.cli.commands.export import HASH
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.dh import dh_table, ur_text, write_dh, write_ur_kinematics
+from diffeo_calib.interop.dh import dh_table, write_dh, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 
 EVERY = {**CHAINS, "every kind of mimic joint": CHAIN}
@@ -215,14 +213,6 @@ def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_
         write_ur_kinematics(geometry, tmp_path / "ur.yaml")
         links, _ = read_yaml(tmp_path / "ur.yaml")
         torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
-
-
-def test_short_numbers_with_exponents_are_numbers_in_yaml(tmp_path: Path) -> None:
-    """1e-05 is a word to YAML 1.1, 1.0e-05 is a number."""
-    links = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
-    links[:, :3, 3] = torch.tensor([1e-5, -2e-22, 3e16], dtype=torch.float64)
-    (tmp_path / "ur.yaml").write_text(ur_text(links, None), encoding="utf-8")
-    assert read_yaml(tmp_path / "ur.yaml")[0]["wrist_3"] == [1e-5, -2e-22, 3e16, 0, 0, 0]
 
 
 def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:

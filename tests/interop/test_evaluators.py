@@ -1,7 +1,5 @@
 """Models evaluated by NumPy, by torch's programs and by generated C: points, slopes and poses of the torch model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -186,9 +184,6 @@ def test_the_tip_of_the_tool_is_named(tmp_path: Path) -> None:
     expected = model.tool_poses(q, tip="right", frame="base")
     near(made.poses(q.numpy()), expected.numpy(), 1e-12)
     assert "frame of the tip right" in files.header.read_text()
-
-
-# --- Tables of periodic functions ---------------------------------------------------------------------------------
 
 
 def periodic_sum(profile: str, lengthscale: float = 0.3, count: int = 40) -> PeriodicSum:

@@ -1,7 +1,5 @@
 """MJCF files: MuJoCo finds the tips where the geometry has them, moves joints within their limits, knows the masses."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

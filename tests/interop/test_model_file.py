@@ -6,8 +6,6 @@ were written at commit 29d55d1, before the package had its present folders and n
 Where a model comes from, and its summary: kept by every copy, saved and loaded, from files of every age.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess
@@ -33,7 +31,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kinematics.provenance import Provenance, Summary
+from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import elastic_rr
@@ -243,20 +241,3 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
     shifted = dc.Measurements(data.q, data.points + 1e-12)
     others = (shifted, arrays.rows(slice(1, None)), dc.Measurements(data.q, data.points, std=1e-5))
     assert len({arrays.sha256, of_the_file, *(other.sha256 for other in others)}) == 5
-
-
-def test_entries_of_a_summary_are_named_with_their_units() -> None:
-    """Unknown numbers are left out, as the first files of version 3 did; JSON knows no infinity."""
-    old: Any = dc.load(DATA / "robot_format_3.safetensors")
-    entries = old.summary.to_dict()  # all of them: test_a_robot
-    assert old.provenance is None
-    assert {"registration rms [m]", "geometry rms [m]", "task space [m]", "rows", "noise degrees of freedom"} < {
-        *entries
-    }
-    for changes in ({}, {"noise_degrees_of_freedom": inf}, {"noise_degrees_of_freedom": None}):
-        summary = replace(old.summary, **changes)
-        assert Summary.from_dict(json.loads(json.dumps(summary.to_dict()))) == summary
-    assert "noise degrees of freedom" not in summary.to_dict()
-    for wrong in ({}, entries | {"mood": "good"}, entries | {"rows": "many"}):
-        with pytest.raises(TypeError, match=r"argument|the entry 'rows' is 'many'"):
-            Summary.from_dict(wrong)

@@ -1,7 +1,5 @@
 """The estimator of scikit-learn: its own checks, and on a robot's table everything that those need other tables for."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

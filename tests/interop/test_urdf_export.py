@@ -1,7 +1,5 @@
 """Corrected URDF files: the poses of the geometry in two readers, and every other byte as it was."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -108,9 +106,6 @@ def test_a_model_brings_its_own_urdf(tmp_path: Path) -> None:
     torch.testing.assert_close(
         dc.load_urdf(tmp_path / "new.urdf", *UGLY_ENDS)(q), own_poses(wrong(chain), q), rtol=0, atol=1e-12
     )
-
-
-# --- wrong input ---------------------------------------------------------------------------------------------------
 
 
 def test_a_robot_without_urdf(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """What the tests of distributed sums run in every process: `python distributed_program.py TASK FOLDER`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Compiled sums are executed: they are kept where nobody but the user can write, or for this process only."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -55,17 +53,6 @@ def test_the_users_folder_is_used_and_closed_to_others(tmp_path: Path) -> None:
     own.chmod(0o755)
     assert cache_folder.cache_folder(NAME) == own
     assert stat.S_IMODE(own.stat().st_mode) == 0o700
-
-
-def test_what_is_made_is_closed_to_others_whatever_the_umask(tmp_path: Path) -> None:
-    before = os.umask(0)
-    try:
-        (tmp_path / "cache").mkdir(mode=0o755)
-        folder = cache_folder.cache_folder(NAME)
-    finally:
-        os.umask(before)
-    assert folder == tmp_path / "cache" / "diffeo_calib" / NAME
-    assert {stat.S_IMODE(one.stat().st_mode) for one in (folder, folder.parent)} == {0o700}
 
 
 def _mode(mode: int, levels: int) -> Callable[[Path], None]:

@@ -1,7 +1,5 @@
 """Sums in several processes: the same numbers as in one, in every rank; a lost rank is an error in all others."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket
@@ -71,9 +69,6 @@ def test_a_killed_rank_is_an_error_in_the_other(tmp_path: Path) -> None:
     assert seconds is not None, said
     assert float(seconds.group(1)) < 30.0
     assert not list(tmp_path.iterdir())
-
-
-# --- In one process ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 3])

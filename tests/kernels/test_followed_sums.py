@@ -1,7 +1,5 @@
 """Sums that torch follows: transforms, forward-mode derivatives, parameters of profiles; and any profile of a user."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

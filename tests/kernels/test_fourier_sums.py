@@ -1,7 +1,5 @@
 """Sums by plane waves: within the accuracy asked for, or over all pairs."""
 
-from __future__ import annotations
-
 from math import pi
 from typing import Any
 

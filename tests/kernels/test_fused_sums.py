@@ -1,7 +1,5 @@
 """Fused sums: they equal sums over one matrix, whatever the threads, the processor's vectors, and what is installed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess
@@ -46,9 +44,6 @@ def test_vectors_of_every_width(lanes: int, monkeypatch: pytest.MonkeyPatch) -> 
     assert_same(fused(FULL, GaussianProfile(), None, j), Dense().reduce(FULL, GaussianProfile(), None, j), 1e-11)
 
 
-# --- The exponential ---------------------------------------------------------------------------------------------
-
-
 def test_the_exponential_is_exact_to_rounding() -> None:
     """From 1 down to the smallest normal numbers, and beyond; the argument itself is rounded, too."""
     r = torch.linspace(0.0, 60.0, 4001, dtype=torch.float64)[:, None]
@@ -74,9 +69,6 @@ def test_points_that_are_far_away_add_nothing() -> None:
     i.features[:] = 1e100
     for nu in (1.5, 3.5):
         assert not any(bool(t.any()) for t in fused(GRADIENT, MaternProfile(nu), i, j))
-
-
-# --- Profiles of a user ------------------------------------------------------------------------------------------
 
 
 def test_numbers_of_a_profile_are_noticed_when_they_change_but_not_compiled_for_ever(
@@ -105,9 +97,6 @@ def test_what_cannot_be_compiled_is_left_to_others() -> None:
         assert Fused().reduce(FIELD, GaussianProfile(), None, unusual) is None
         expected = Dense().reduce(FIELD, GaussianProfile(), None, unusual)
         assert_same(backends.evaluate(FIELD, GaussianProfile(), None, unusual, "fused"), expected, 1e-12)
-
-
-# --- Compiling ----------------------------------------------------------------------------------------------------
 
 
 def test_compiled_code_is_kept_and_damaged_files_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

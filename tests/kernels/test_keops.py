@@ -4,8 +4,6 @@ Every formula is compiled with one profile, the other operations of profiles wit
 7 s where KeOps' cache folder is empty.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -83,9 +81,6 @@ def test_tiled_sums_replace_keops_where_gradients_are_needed(live: int) -> None:
         assert not any(t.requires_grad for t in again)
         assert_same(again, results, 1e-12)
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=1e-12)
-
-
-# --- The environment ----------------------------------------------------------------------------------------------
 
 
 def in_a_process(code: str, **environment: str) -> Any:

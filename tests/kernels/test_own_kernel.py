@@ -1,7 +1,5 @@
 """A user's kernel that defines only its matrix, and a user's radial profile: every method, fits, files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -163,9 +161,6 @@ def test_a_wrong_profile_is_refused(profile: Profile, words: str) -> None:
         RadialKernel(RationalQuadratic(alpha))
     with pytest.raises(InputError, match=words):
         RadialKernel(profile)
-
-
-# --- files ---------------------------------------------------------------------------------------------------------
 
 
 def nominal(x: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Kernel sums of every backend: those of one matrix, on unusual input, differentiable; which backend is chosen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -28,7 +26,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.reductions import backends, tiled
+from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
 from diffeo_calib.kernels.reductions.fused import Fused
@@ -102,31 +100,6 @@ def test_the_number_of_threads_changes_no_digit(formula: Formula, backend: str) 
     assert_same(found[0], of("dense"), 1e-9)
 
 
-def test_memory_is_bounded_by_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """20000 points on one thread: tiles fit the cache, each pair is visited once, and buffers are recycled."""
-    count, sizes, recycled = 20_000, list[int](), tiled._recycled
-
-    def watched(weights: Any, elements: int, i: Points, j: Points) -> Any:
-        sizes.append(len(i.features) * len(j.features))
-        return recycled(weights, elements, i, j)
-
-    monkeypatch.setattr(tiled, "_recycled", watched)
-    many = Points(normal(count, 3, seed=1), normal(count, 1, seed=2))
-    buffers = tiled.BUFFERS.of(tiled.CPU_ELEMENTS, many.features)
-    buffers.clear()
-    with torch_threads(1):
-        (total,) = backends.evaluate(FIELD, GaussianProfile(), None, many, "tiled")
-    assert max(sizes) <= tiled.CPU_ELEMENTS
-    assert sum(sizes) < 0.52 * count**2
-    tiled.BUFFERS.of(1, many.features)  # takes back what was lent
-    assert 0 < len(buffers) <= 4
-    few = many._replace(features=many.features[:3])
-    assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
-
-
-# --- Differentiation --------------------------------------------------------------------------------------------
-
-
 def derivatives(reduce: Callable[..., Any], formula: Formula, profile: Profile, same: bool) -> list[Tensor]:
     """Value, gradient and a Hessian product of a weighted sum of all results, in all inputs."""
     i, j = (None if p is None else mapped(p, lambda t: t.clone().requires_grad_()) for p in sides(same))
@@ -161,9 +134,6 @@ def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
     assert torch.autograd.gradgradcheck(gradient, live)
 
 
-# --- Recorded weights -------------------------------------------------------------------------------------------
-
-
 OPERATIONS: dict[str, Callable[[Any, Any], Any]] = {
     "sums": lambda x, y: x + y + (3.0 * x + 2.0 * y) * (x - y),
     "shifts": lambda x, y: (x + 2.0) * (2.0 - 4.0 * x) + (x + x),
@@ -194,9 +164,6 @@ def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], ba
     assert recorded(formula, GaussianProfile()) is not None
     found = backend.reduce(formula, GaussianProfile(), i, j)
     assert_same(found, Dense().reduce(formula, GaussianProfile(), i, j), 1e-11)
-
-
-# --- Dispatch ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("compiled", [True, False])

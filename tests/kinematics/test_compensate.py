@@ -1,7 +1,5 @@
 """Commands that bring a calibrated tool to its targets: round trips, optimality in the box, statuses."""
 
-from __future__ import annotations
-
 from math import radians
 
 import numpy as np
@@ -14,7 +12,6 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.compensate import Pace
 from diffeo_calib.measurements.poses import angle_between
 
 BOUND = radians(1.0)
@@ -42,9 +39,6 @@ def misses(case: Case, q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
 def inside(case: Case, found: dc.Compensation, bound: float = BOUND) -> bool:
     low, high = case.robot.limits.unbind(1)
     return bool(((found.q >= low) & (found.q <= high) & (found.correction.abs() <= bound)).all())
-
-
-# --- reached --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frame", ["base", "measuring"])
@@ -98,9 +92,6 @@ def test_positions_with_the_direction_of_an_axis(arm: Case) -> None:
         assert float((1 - cosine)[found.reached].max()) <= 1e-14
         turned = angle_between(poses[:, :3, :3], targets[:, :3, :3])
         assert float(turned[found.reached].max()) > 1e-5  # the turn about the axis is free
-
-
-# --- not reached ----------------------------------------------------------------------------------------------------
 
 
 def test_a_slide_has_a_bound_in_metres() -> None:
@@ -170,27 +161,6 @@ def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
     assert dc.compensate(arm.model, aside, regular, tool=tool_frame()).counts.get("singular", 0) == 0
 
 
-def test_a_stretched_arm_ends_where_the_workspace_does(arm: Case) -> None:
-    """Targets beside a stretched elbow, by what searches without a bound find from both sides."""
-    straight = torch.zeros(6201, 6, dtype=torch.float64)
-    straight[:, 2] = torch.linspace(-3.1, 3.1, 6201, dtype=torch.float64)
-    frames, q = arm.robot.joint_frames(straight)[..., :3, 3], commands(arm, 60, seed=7)
-    q[:, 2] = straight[(frames[:, 4] - frames[:, 1]).norm(dim=1).argmax(), 2]
-    targets, possible = intended(arm, q), torch.zeros(60, dtype=torch.bool)
-    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    for side in (-0.3, -0.1, 0.1, 0.3):
-        bent = q + torch.tensor([0.0, -side / 2, side, -side / 2, 0.0, 0.0])
-        wide = dc.compensate(arm.model, targets, bent, tool=tool_frame(), bound=0.8, limits=[[-20.0, 20.0]] * 6)
-        possible |= wide.reached
-    judged = torch.tensor([s in ("singular", "unreachable") for s in found.status])
-    singular = torch.tensor([s == "singular" for s in found.status])
-    assert int(judged.sum()) > 30
-    assert float((possible == singular)[judged].double().mean()) > 0.95
-
-
-# --- limits ---------------------------------------------------------------------------------------------------------
-
-
 def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
     q, joint = commands(arm, 40, seed=8), 1
     q[:, joint] *= 0.02  # so that some rows begin within the limit and need to go beyond it
@@ -211,9 +181,6 @@ def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
     assert found.counts["limit"] > 5
 
 
-# --- input ----------------------------------------------------------------------------------------------------------
-
-
 WRONG: tuple[tuple[dict[str, object], str], ...] = (
     ({"targets": torch.full((3, 3), float("nan"))}, r"`targets` has 9 value\(s\) that are not finite.*\[0, 0\]"),
     ({"start": torch.zeros(3, 7)}, r"`start` has the wrong shape: expected \(N, 6\)"),
@@ -222,15 +189,12 @@ WRONG: tuple[tuple[dict[str, object], str], ...] = (
     ({"axis": torch.zeros(3, 3)}, r"`axis`, row 0: expected a direction"),
     ({"targets": torch.eye(4).repeat(3, 1, 1), "axis": torch.ones(3, 3)}, "`axis` beside target poses"),
     ({"axis": torch.ones(3, 3), "tool_axis": "w"}, "`tool_axis`: expected 'x', 'y' or 'z'"),
-    ({"axis": torch.ones(3, 3), "tool_axis": [1]}, "`tool_axis`: expected 'x', 'y' or 'z'"),
     ({"frame": "flange"}, "`frame`: expected 'base' or 'measuring'"),
     ({"bound": [1.0, 2.0]}, "`bound` has the wrong shape"),
-    ({"weights": [1.0] * 5}, "`weights` has the wrong shape"),
     ({"lever": 0.0}, "`lever`"),
     ({"limits": [[1.0, -1.0]] * 6}, "`limits` of joint 'waist_joint': expected lower <= upper"),
     ({"model": 3}, "`model`: expected a calibrated model of a robot, got int"),
     ({"rate": 0.1}, "`rate` and `time` limit how fast the corrections of a path change"),
-    ({"path": True, "rate": -0.1}, "`rate`"),
     ({"path": True, "time": [0.0, 1.0, 1.0]}, "`time`, row 2: expected increasing times, got 1 after 1"),
 )
 
@@ -246,9 +210,6 @@ def test_no_rows_and_wrong_input(arm: Case) -> None:
         given = {"model": arm.model, "targets": torch.zeros(3, 3), "start": torch.zeros(3, 6)} | changed
         with pytest.raises(InputError, match=message):
             dc.compensate(**given)  # pyright: ignore[reportArgumentType]
-
-
-# --- paths: corrections that change slowly, jumps that are named, commands that start at the row before -------------
 
 
 def line(case: Case, rows: int, seed: int = 3) -> Tensor:
@@ -303,30 +264,3 @@ def test_through_a_singularity_the_corrections_stay_slow(arm: Case) -> None:
             assert float((found.q - alone.q)[row].abs().max()) > 1e-9
     assert float(distance.max()) < 2e-3
     assert found.counts["reached"] > 40
-
-
-def test_the_slowest_change_of_a_jump() -> None:
-    """A step is passed half before and half after; rows that miss their targets give way; NaN counts as nothing."""
-    pace = Pace(np.arange(9.0), np.array([1.0]))
-    step = np.array([0.0] * 4 + [4.0] * 5)[:, None]
-    found = pace.limited(step, np.ones(9, dtype=bool))[:, 0]
-    np.testing.assert_allclose(found, [0, 0.5, 1, 1.5, 2.5, 3, 3.5, 4, 4])
-    spike = np.zeros((9, 1))
-    spike[4] = 3.0
-    firm = np.arange(9) != 4
-    np.testing.assert_allclose(pace.limited(spike, firm)[:, 0], [0, 0, 0, 0, 1, 0, 0, 0, 0])
-    spike[4] = np.nan
-    kept = pace.limited(spike, firm)[:, 0]
-    assert np.isnan(kept[4])
-    assert not np.delete(kept, 4).any()
-
-
-def test_one_start_for_a_whole_path(arm: Case) -> None:
-    q = line(arm, 12)
-    targets = intended(arm, q)
-    found = dc.compensate(arm.model, targets, q[0], tool=tool_frame())
-    assert bool(found.reached.all())
-    torch.testing.assert_close(found.start[1:], found.q[:-1], rtol=0, atol=0)
-    torch.testing.assert_close(found.start[0], q[0], rtol=0, atol=0)
-    every = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    torch.testing.assert_close(found.q, every.q, rtol=0, atol=1e-7)

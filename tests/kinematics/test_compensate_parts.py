@@ -1,15 +1,9 @@
 """Commands for both hands of a small robot: against the model itself and one hand at a time; mimic joints."""
 
-from __future__ import annotations
-
-import gc
-import weakref
-
 import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
-from product_bank import Case
 from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
@@ -108,13 +102,6 @@ def test_the_nearest_command_weighs_both_hands(model: dc.CalibratedKinematics, q
     assert float((slope * inside).norm(dim=1).max()) < 1e-4 * float(before.norm(dim=1).max())
 
 
-def test_the_tool_of_the_model_is_that_of_its_tip(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
-    wanted = torch.stack([model.tool_poses(q, TOOLS[0], tip="left"), model.tool_poses(q, None, tip="right")], dim=1)
-    found = dc.compensate(model.with_tool(TOOLS[0], "left"), wanted, start)
-    assert bool(found.reached.all())
-    assert_close(model.tool_poses(found.q, TOOLS[0], tip="left"), wanted[:, 0], rtol=0, atol=2e-9)
-
-
 def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     targets, start = torch.zeros(2, 2, 3, dtype=torch.float64), torch.zeros(2, 5)
     missing = targets.clone()
@@ -132,28 +119,16 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
 
 
-def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
-    model = arm.model.with_tool([0.0, 0.0, 0.1])
-    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
-    seen = weakref.ref(model)
-    del model
-    gc.collect()
-    assert seen() is None
-
-
 @pytest.mark.parametrize("axes", [3, 1, 0])
 def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int) -> None:
     """By central differences, of rigid kinematics far from the targets, a free hand in two rows."""
     rng, h, free = np.random.default_rng(1), 1e-5, np.zeros((6, 2), dtype=bool)
     free[1, 0] = free[4, 1] = True
-    poses, q = (
-        twist_transform(torch.from_numpy(rng.standard_normal((6, 2, 6)))).numpy(),
-        rng.uniform(-2, 2, (6, model.robot.n)),
-    )
+    poses = twist_transform(torch.from_numpy(rng.standard_normal((6, 2, 6)))).numpy()
+    q = rng.uniform(-2, 2, (6, model.robot.n))
     goal = Targets(poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :], 0.3, free)
-    chain = calibrated_chain(
-        model.robot.arrays, np.eye(4), model.geometry.joint_errors.numpy(), np.zeros(6 + 6 * model.robot.moving)
-    )
+    errors = model.geometry.joint_errors.numpy()
+    chain = calibrated_chain(model.robot.arrays, np.eye(4), errors, np.zeros(6 + 6 * model.robot.moving))
 
     def slope(at: np.ndarray) -> np.ndarray:
         there, jacobian = chain.poses_and_jacobian(at)
@@ -167,9 +142,6 @@ def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: 
         np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
         change = (slope(q + step) - slope(q - step)) / (2 * h)
         np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
-
-
-# --- limits of mimic joints -----------------------------------------------------------------------------------------
 
 
 def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:

@@ -1,7 +1,5 @@
 """Data frames of pandas and polars wherever joints are passed: columns by name, in any order, among others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError, RobotError
+from diffeo_calib.common.errors import InputError, MeasurementError
 
 LIBRARIES = [pytest.param(pd.DataFrame, id="pandas"), pytest.param(pl.DataFrame, id="polars")]
 Table = Callable[[dict[str, Any]], Any]
@@ -83,28 +81,6 @@ def test_data_frames_that_cannot_be_taken(table: Table, arm: Case) -> None:
         arm.model(twice)
 
 
-@pytest.mark.parametrize("table", LIBRARIES)
-def test_measurements_of_a_data_frame_know_the_names(table: Table, arm: Case) -> None:
-    """All columns are joints if none are named; another order than the robot's is refused later, not guessed."""
-    q, points, names = arm.test.q[:4], arm.test.points[:4], arm.robot.joint_names
-    data = dc.Measurements(table({name: q[:, k].numpy() for k, name in enumerate(names)}), points)
-    assert data.joint_names == names
-    assert torch.equal(data.q, q)
-    turned = dc.Measurements(
-        table({name: q[:, k].numpy() for k, name in reversed(list(enumerate(names)))}), points, doubt=False
-    )
-    assert turned.joint_names == names[::-1]
-    with pytest.raises(InputError, match="put the columns in the robot's order"):
-        dc.evaluate(arm.model, turned)
-    with pytest.raises(RobotError, match="put the columns in the robot's order"):
-        dc.calibrate(arm.robot, turned)
-    with pytest.raises(MeasurementError, match="column 'measured' of the data frame `q` cannot be read"):
-        dc.Measurements(shuffled(table, arm.robot, q), points)
-
-
-# --- results as data frames of pandas -------------------------------------------------------------------------------
-
-
 def test_errors_of_every_row(pair: Case) -> None:
     data = pair.test[5:25]
     found = dc.evaluate(pair.model, data)
@@ -146,12 +122,3 @@ def test_measurements_come_back(pair: Case) -> None:
     assert torch.equal(again.points, data.points)
     known = dc.Measurements(data.q, data.points, std=1e-5).to_frame()
     assert (known[[f"std_marker{k}_{axis}" for k in (1, 2) for axis in "xyz"]] == 1e-5).all(axis=None)
-
-
-def test_predictions_keep_the_index(arm: Case) -> None:
-    frame = pd.DataFrame(arm.test.q[:3].numpy(), columns=list(arm.robot.joint_names), index=["a", "b", "c"])
-    found = arm.model.to_frame(frame)
-    mean, covariance = arm.model.predict(arm.test.q[:3])
-    assert list(found.index) == ["a", "b", "c"]
-    np.testing.assert_allclose(found[["x", "y", "z"]], mean[:, 0])
-    np.testing.assert_allclose(found[["std_x", "std_y", "std_z"]] ** 2, covariance[:, 0].diagonal(dim1=1, dim2=2))

@@ -1,9 +1,6 @@
 """Errors of kinematics against NumPy, in position and orientation, and warnings about calibrated models."""
 
-from __future__ import annotations
-
 import math
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import implausible, judge
+from diffeo_calib.calibration.diagnostics.judged_rows import judge
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import place, residuals, rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
@@ -36,9 +33,6 @@ def test_numbers_are_numpy_s(rows: int, markers: int) -> None:
     assert found.mean == pytest.approx(float(np.mean(distances)), rel=1e-12)
     for value, share in ((found.median, 0.5), (found.p95, 0.95), (found.max, 1.0), (found.quantile(0.25), 0.25)):
         assert value == pytest.approx(float(np.quantile(distances, share)), rel=1e-12)
-
-
-# --- poses ----------------------------------------------------------------------------------------------------------
 
 
 def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
@@ -86,9 +80,6 @@ def test_predictions_that_do_not_fit_the_rows(posed: Case, arm: Case) -> None:
         dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)
 
 
-# --- calibrated models ----------------------------------------------------------------------------------------------
-
-
 def test_rows_of_the_fit_are_recognised_up_to_rounding(arm: Case) -> None:
     fitted, others = arm.train.q, arm.test.q
     mixed = torch.cat([others[:2], fitted[5:8] + 1e-10, fitted[5:6] + 1e-8])
@@ -126,29 +117,6 @@ def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
         warn_outside_range(arm.model, q)
     assert record[0].filename == __file__
-
-
-def test_implausible_errors_have_a_sentence(arm: Case, posed: Case) -> None:
-    assert implausible(arm.model, arm.test, dc.evaluate(arm.model, arm.test)) is None
-    shifted = dc.Measurements(arm.test.q, arm.test.points + 0.05)
-    errors = dc.evaluate(arm.model, shifted)
-    text = implausible(arm.model, shifted, errors) or ""
-    assert text.startswith("these errors are not those of a calibrated robot: expected a median of about ")
-    assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
-    unsure = arm.model.changed(map=arm.model.map.inflated(1e5))
-    for shift, told in ((0.05, False), (0.15, True)):  # a tenth of the reach is too much whatever a model expects
-        shifted = dc.Measurements(arm.test.q, arm.test.points + shift)
-        assert (implausible(unsure, shifted, dc.evaluate(arm.model.__call__, shifted)) is not None) == told
-    zero = np.zeros((len(posed.test), 3))
-    turned = dc.Measurements.from_poses(posed.test.q, moved(posed.test.poses, zero, zero + 0.03))
-    text = implausible(posed.model, turned, dc.evaluate(posed.model, turned)) or ""
-    assert re.search(r"about 0\.0\d+ degrees by the model's .* got 2\.98 degrees; check .*`convention`", text)
-    far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
-    with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--free both"):
-        dc.evaluate(arm.model, far)
-
-
-# --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------
 
 
 def in_other_unit(rows: Any, factor: float) -> Any:

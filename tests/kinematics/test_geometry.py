@@ -1,21 +1,18 @@
 """Geometric errors, gravity sag, gears and axes: points, what absorbing errors means, names."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from math import pi
 
 import pytest
 import torch
-from deformation_bank import deformation_of, errors_of, geometry_of, model_of
+from deformation_bank import deformation_of, errors_of, geometry_of
 from robots_bank import CHAIN, CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
-from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain, Geometry, Joint, from_dh
 from diffeo_calib.robots.gravity import GravitySag
 
@@ -100,9 +97,6 @@ def test_wrong_input_is_explained(chain: Chain) -> None:
         replace(Geometry.nominal(CHAIN), joint_errors=eye.repeat(3, 1, 1))
 
 
-# --- the nominal map of a robot ---------------------------------------------------------------------------------------
-
-
 @every_chain
 def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
     """Row by row, with the sum of the error twists of parameters and deflection."""
@@ -115,9 +109,6 @@ def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
         assert_close(value, geometry.points(row[None], errors).flatten(), rtol=1e-13, atol=1e-14)
 
 
-# --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
-
-
 def test_a_wave_turns_its_joint_and_nothing_else() -> None:
     chain = CHAINS["arm"]
     plain, waves = deformation_of(chain).spec.nominal, errors_of(chain).waves
@@ -128,26 +119,6 @@ def test_a_wave_turns_its_joint_and_nothing_else() -> None:
     for k, (joint, w) in enumerate(waves):
         turned[:, joint] += c[2 * k] * (w * x[:, joint]).cos() + c[2 * k + 1] * (w * x[:, joint]).sin()
     assert_close(with_waves(x, torch.cat([theta, c])), plain(turned, theta), rtol=0, atol=1e-14)
-
-
-def test_lines_have_names() -> None:
-    model = model_of(CHAINS["arm"], waves=True)
-    found = {line.frequency: line for line in gear_lines(model)}
-    C, S = model.map.deformation.momenta.theta[model.nominal.parts["waves"]][2:4].tolist()
-    last, largest = model.robot.joint_names[-1], gear_lines(model)
-    assert [line.displacement for line in largest] == sorted((x.displacement for x in largest), reverse=True)
-    assert found[14.7].amplitude == pytest.approx((C * C + S * S) ** 0.5)
-    assert found[14.7].multiple == 2
-    assert found[14.7].sentence.startswith(f"{last}: gear line 14.7 per rad = 2 x 7.35, ")
-    assert found[7.3].multiple == found[5.1].multiple == 1
-    values = torch.linspace(-1.0, 1.0, 7, dtype=torch.float64)
-    wave = found[5.1].amplitude * (5.1 * values - found[5.1].phase).cos()
-    x = torch.nn.functional.pad(values[:, None], (0, model.robot.n - 1))
-    by_axis = model.nominal.along_axis(x, 0) @ model.map.deformation.momenta.theta
-    first, plain = model.robot.joint_names[0], model_of(CHAINS["arm"])
-    expected = plain.transmission(first, values) + wave + by_axis
-    assert_close(model.transmission(first, values), expected, rtol=0, atol=1e-12)
-    assert gear_lines(plain) == ()
 
 
 @pytest.mark.parametrize("name", ["arm", "slides", "mimic slides"])

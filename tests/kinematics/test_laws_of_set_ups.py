@@ -3,8 +3,6 @@
 What is known of a camera and its board is what small changes of the fit's parameters do to their poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -148,19 +146,3 @@ def test_covariances_are_those_of_small_changes(name: str) -> None:
             expected = J @ fitted.parameter_covariance(which) @ J.mT + left @ left.mT
             size = known.deviations[:, None] * known.deviations
             torch.testing.assert_close(known.covariance / size, expected / size, rtol=0, atol=0.02)
-
-
-@pytest.mark.slow
-def test_a_mount_that_no_row_of_the_fit_tells_of_is_known_as_before() -> None:
-    """Its deviations, along the axes of the model's tool, are added."""
-    model, std = kind_named("two cameras on the tool").model, 1e-3 * torch.arange(1.0, 7.0).double()
-    mounts, *others = sorted(model.placement, key=lambda own: own.kind != "mounted frame")
-    tool = poses_from_marks(model.geometry.tool[None], model.bodies.pose_lever())[0]
-    mount = mounts.constants[1].view(4, 4)
-    known = []
-    for deviations in (torch.zeros_like(std), std):
-        alone = replace(mounts, rows=mounts.rows[:0], device=mounts.device[:0], deviations=deviations.expand(2, 6))
-        own = model.changed(placement=(alone, *others))
-        known.append(HandEye.of(own, camera_on_tool=True, camera=mounts.names[1]).camera.covariance)
-    J = changes(lambda step: tool @ twist_transform(step) @ mount, 6) * std
-    torch.testing.assert_close(known[1] - known[0], J @ J.mT, rtol=1e-6, atol=1e-14)

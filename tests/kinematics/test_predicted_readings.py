@@ -1,23 +1,17 @@
 """What devices will read: means as their readings, regions that hold new ones, units, and the command's columns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from math import isfinite
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_bank import Command
-from kind_bank import UNITS, Kind, kind_named, marked
+from kind_bank import Kind, kind_named, marked
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.device_readings import PredictedReadings
-from diffeo_calib.sensors import kinds
-from diffeo_calib.sensors.range import FixedPoints
 
 KINDS = ("distances", "heights", "images", "several kinds")
 
@@ -93,38 +87,3 @@ def test_means_are_the_observations_of_the_model(tmp_path: Any) -> None:
         assert_close(own.mean, expected, rtol=0, atol=1e-6)
         assert own.unit == "px"
     assert kind_named("positions").model.predict_readings(kind_named("positions").q(2)) == []
-
-
-def test_the_command_writes_lengths_in_the_unit_of_the_table(command: Command, tmp_path: Any) -> None:
-    kind = kind_named("several kinds")
-    path, written = tmp_path / "q.csv", tmp_path / "p.csv"
-    names, q = kind.robot.joint_names, kind.q(3)
-    path.write_text("\n".join(",".join(map(str, row)) for row in [names, *q.rad2deg().tolist()]))
-    done = command("predict", kind.file, path, *UNITS, "-o", written)
-    assert done.code == 0, done.err
-    table = np.genfromtxt(written, delimiter=",", names=True, deletechars="")
-    for own in kind.model.predict_readings(q):
-        columns = [
-            f"{own.kind}_{own.device}{end}".replace(" ", "_") for end in (("",), ("_1", "_2"))[len(own.mean[0]) - 1]
-        ]
-        for number, column in enumerate(columns):
-            np.testing.assert_allclose(table[column], own.mean[:, number], atol=1e-3)
-            np.testing.assert_allclose(table[f"std_{column}"], own.deviations[:, number], rtol=1e-2)
-            assert all(map(isfinite, table[column]))
-        assert f"{own.kind}_{own.device}" in done.out
-        assert {"px": "in px", "mm": "in mm"}[own.unit] in done.out
-
-
-def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, monkeypatch: Any) -> None:
-    kind = kind_named("heights")
-    dc.save(kind.model, tmp_path / "m.safetensors")
-    monkeypatch.delitem(kinds.KINDS, "height")
-    words = "kind 'height', which is not registered here: their readings.*import the module.*load the model again"
-    with pytest.warns(dc.DiffeoCalibWarning, match=words):
-        model: Any = dc.load(tmp_path / "m.safetensors")
-    assert model.predict_readings(kind.q(2)) == []
-    monkeypatch.setitem(kinds.KINDS, "height", FixedPoints)
-    with pytest.warns(dc.DiffeoCalibWarning, match="is not registered here with 3 increments"):
-        dc.load(tmp_path / "m.safetensors")
-    with pytest.raises(dc.DiffeoCalibError, match=r"kind 'height' in a model.*load the model again"):
-        model.placement[0].carried(torch.eye(4), torch.zeros(0), torch.zeros(0), torch.zeros(0))

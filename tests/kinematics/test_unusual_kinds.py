@@ -1,7 +1,5 @@
 """Kinds of arrays that are not plain: right answers or one clear sentence at every public name that takes arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial, reduce
 from typing import Any

@@ -1,7 +1,5 @@
 """Noise with shifts that rows share, against the explicit matrix; and the measurements that a fitted map implies."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from fit_bank import shared_noise
@@ -54,9 +52,6 @@ def test_a_map_knows_its_measurements(reduced: bool) -> None:
     again = dc.fit(problem, solver, steps, controls=controls, start=fitted.momenta)
     new = uniform(20, 2, seed=8)
     torch.testing.assert_close(again.model(new), fitted.model(new), rtol=0.0, atol=1e-4)
-
-
-# --- coordinates that were not measured ---------------------------------------------------------------------------
 
 
 def gaps(rows: int = 9, m: int = 6) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,5 @@
 """A deformation at its own controls, and rows of several kinds as one observation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -46,8 +44,6 @@ def test_values_at_the_controls_are_those_of_the_fit() -> None:
     ):
         assert other.at_controls(at) is None
 
-
-# --- rows of several kinds ----------------------------------------------------------------------------------------
 
 N, M, R = 7, 6, 3
 Z = normal(N, M, seed=1)

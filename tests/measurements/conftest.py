@@ -1,7 +1,5 @@
 """Reading a table that a test writes out as text."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

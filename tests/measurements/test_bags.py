@@ -1,7 +1,5 @@
 """Bags of ROS as tables of stops, and as images with their joint values. Skipped without rosbags."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

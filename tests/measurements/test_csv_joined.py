@@ -1,7 +1,5 @@
 """Two files as one table, joined by names, times, or the stops of recordings with clocks of their own."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

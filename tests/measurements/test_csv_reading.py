@@ -208,7 +208,7 @@ def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) 
 
 SLIDE: dict[str, Any] = {"kinds": ["prismatic", "revolute"], "angle": "deg"}
 POSED: dict[str, Any] = {"rotation": ["a", "b", "c"], "convention": "XYZ", "rotation_angle": "deg"}
-UNKNOWN = "look like degrees, or like millimetres of a prismatic joint; pass the robot, which knows"
+UNKNOWN = "look like degrees; pass angle='deg' if they are, or pass the robot, which knows"
 ODD: list[tuple[str, dict[str, Any], str]] = [
     ("0,90,1,2,3", {}, "90 rad: they " + UNKNOWN),
     ("0,90,1,2,3", {"kinds": ["revolute"] * 2}, "90 rad: they look like degrees; pass angle='deg'"),

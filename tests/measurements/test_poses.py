@@ -1,7 +1,5 @@
 """Rotations against SciPy and against written-out formulas, and poses as three points: there, back, and derivatives."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -42,9 +40,6 @@ def turn(axis: str, angle: float) -> np.ndarray:
     c, s = math.cos(angle), math.sin(angle)
     rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
     return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
-
-
-# --- conventions ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", ["rad", "deg"])
@@ -129,9 +124,6 @@ def test_angles_between_rotations(size: float) -> None:
     assert float(angle_between(R, R).max()) < 1e-15
 
 
-# --- poses as points ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("lever", [0.001, 0.1, 3.0])
 def test_points_are_an_equilateral_triangle_around_the_origin_and_lead_back(lever: float) -> None:
     poses = random_poses(20)
@@ -177,8 +169,6 @@ def test_rounded_transforms_become_rigid() -> None:
     assert_close(found, poses, rtol=0, atol=2e-5)
     assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
 
-
-# --- derivatives ----------------------------------------------------------------------------------
 
 ROWS, STEP = 6, 1e-6
 

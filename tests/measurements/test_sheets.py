@@ -106,6 +106,13 @@ def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str) -> None:
         assert bool(said) == (kind in NOTES)
 
 
+@pytest.mark.parametrize(("length", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+def test_lengths_in_every_unit(length: str, metres: float, tmp_path: Path) -> None:
+    np.save(tmp_path / "t.npy", ROWS / np.array([1, 1, metres, metres, metres]))
+    data = warned(read_measurements, tmp_path / "t.npy", ["1", "2"], ["3", "4", "5"], length=length, angle="rad")[0]
+    torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES))
+
+
 def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
     """Whatever size the file says that the sheet has: some programs write that of one cell."""
     _book(tmp_path / "t.xlsx")
@@ -117,12 +124,6 @@ def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
         assert [line for line, _ in rows] == list(range(4, 11))
 
 
-def test_a_text_may_begin_with_the_name_of_a_program(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("MATLAB export of Monday\nq1,q2\n1.5,2.5\n", encoding="utf-8")
-    file = CsvLines(tmp_path / "t.csv", ",")
-    assert (file.header, file.rows()) == (["q1", "q2"], [(3, ["1.5", "2.5"])])
-
-
 def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
@@ -130,16 +131,6 @@ def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     (_, first), *_ = file.rows()
     assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
-
-
-def test_cells_of_texts_are_a_column(tmp_path: Path) -> None:
-    """And not those that hold something else."""
-    own = {"day": np.array(["mon", "tuesday"], dtype=object), "all": np.array([{"a": 1.0}, "b"], dtype=object)}
-    savemat(tmp_path / "t.mat", {"q": JOINTS[:2], **own})
-    file = CsvLines(tmp_path / "t.mat", ",")
-    assert file.header == ["q_1", "q_2", "day"]
-    assert [cells[2] for _, cells in file.rows()] == ["mon", "tuesday"]
-    assert file.notes == ["arrays all left out: no numbers or texts of 2 rows"]
 
 
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {

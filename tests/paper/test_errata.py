@@ -1,7 +1,5 @@
 """The errata of the paper, each shown on its test bed, and its numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

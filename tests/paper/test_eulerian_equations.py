@@ -1,7 +1,5 @@
 """The paper's formulation at fixed points: equations (16)-(21) one by one, and the exact model for comparison."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -16,8 +14,6 @@ from diffeo_calib.fitting.problem import slope, tangent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.nominal import as_nominal
 from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem
-
-# --- A second implementation: loops over points and components in numpy; the constants of section 5 are typed here ----
 
 
 def k_v(d: np.ndarray) -> float:
@@ -135,9 +131,6 @@ def test_gradient_against_finite_differences(equations: Eulerian, integrator: In
     direction, h = normal(7, 2, seed=6), 1e-5
     difference = float(energy(P0 + h * direction) - energy(P0 - h * direction)) / (2 * h)
     assert float((found[1] * direction).sum()) == pytest.approx(difference, rel=tolerance)
-
-
-# --- Beside the exact model -------------------------------------------------------------------------------------------
 
 
 def test_agrees_with_the_exact_model_to_first_order() -> None:

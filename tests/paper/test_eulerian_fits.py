@@ -1,20 +1,17 @@
 """Fits in the paper's formulation: its algorithms, gradient descent, and what it does not support."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
 from eulerian_bank import P0, deformed
-from listings import Descent, Discretisation, evaluate, lr_calibration
+from listings import Descent, lr_calibration
 from math_bank import few_points, uniform
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.problem import tangent
-from diffeo_calib.paper.eulerian import Eulerian, EulerianProblem
 from diffeo_calib.robots import elastic_rr
 
 
@@ -32,17 +29,6 @@ def test_a_fit_of_an_easy_problem(tmp_path: Path) -> None:
     for action in (lambda: fit.model.predict(x), lambda: dc.save(fit.model, tmp_path / "model.safetensors")):
         with pytest.raises(InputError, match='formulation="exact"'):
             action()
-
-
-def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
-    problem = few_points()
-    eulerian = EulerianProblem(problem)
-    begin, evaluations = eulerian.start(dc.RK4(2))
-    reached = eulerian.deform(begin, dc.RK4(2))
-    first = eulerian.deform(eulerian.unknowns(tangent(problem).momenta()), dc.RK4(2))
-    assert evaluations > 2
-    assert float(eulerian.energy(reached).total) < float(eulerian.energy(first).total)
-    assert eulerian.end_residual(reached) < 0.2 * eulerian.end_residual(first)
 
 
 def test_overflow_is_reported() -> None:
@@ -67,9 +53,6 @@ def test_wrong_arguments_are_one_clear_error(arguments: dict[str, object], messa
         dc.fit(few_points(), integrator=dc.RK4(1), **arguments)  # pyright: ignore[reportArgumentType]
 
 
-# --- the paper's two algorithms and its test bed ----------------------------------------------------------------------
-
-
 STEP = 0.05
 
 
@@ -85,28 +68,6 @@ def test_algorithm_1_is_gradient_descent_from_zero() -> None:
     assert not result[1].requires_grad
     settled = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e6, 12))
     assert not bool(settled[1].any())  # the tolerance is met at once
-
-
-@pytest.mark.parametrize("equations", [Eulerian(), Eulerian(printed_jacobian=False)], ids=repr)
-def test_algorithm_2_is_the_fitted_model(equations: Eulerian) -> None:
-    problem = few_points()
-    fit = dc.fit(problem, dc.LBFGS(max_iterations=10), dc.RK4(2), formulation="eulerian", **vars(equations))
-    xi = uniform(9, 2, seed=1)
-    K = problem.spec.joint_kernel, problem.spec.task_kernel
-    k1, jacobian = evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, Discretisation(equations))
-    torch.testing.assert_close(k1, fit.model(xi), rtol=0, atol=1e-14)
-    torch.testing.assert_close(jacobian, fit.model.jacobian(xi), rtol=0, atol=1e-14)
-    with pytest.raises(InputError, match="`xi`"):
-        evaluate(xi[:, :1], problem.x, fit.momenta.task, elastic_rr.nominal, *K)
-    with pytest.raises(InputError, match=r"`P0` has the wrong shape.*what `lr_calibration` returned"):
-        evaluate(xi, problem.x, fit.momenta.task[:2], elastic_rr.nominal, *K)
-    with pytest.raises(InputError, match="`K_W`"):
-        evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
-    with pytest.raises(InputError, match=r"`k\(xi\)`"):
-        evaluate(xi * 0 + 7, problem.x, fit.momenta.task, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
-
-
-# --- gradient descent with a fixed step -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Linearised rows of every kind of device."""
 
-from __future__ import annotations
-
 import process_bank
 import pytest
 from process_bank import Case

@@ -1,7 +1,5 @@
 """The process conditioned on rows: against formulas with the whole covariance, in any order, with priors of a metre."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -46,9 +44,6 @@ def unknowns(process: Process) -> tuple[Tensor, Tensor]:
     return process.estimate, process.posterior(alone)[0]
 
 
-# --- the posterior ------------------------------------------------------------------------------------------------
-
-
 def test_posterior_is_that_of_the_whole_covariance(case: Case) -> None:
     at, found, y = case.numbers.cells, case.posterior, case.numbers.target
     S, P = case.unknowns[at], torch.diag(case.variance)
@@ -85,9 +80,6 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     target = case.data.target.flatten()
     close(mean, gain @ target[at], 1e-6)
     close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
-
-
-# --- one block after the other ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("most", [0, 1000])
@@ -174,24 +166,6 @@ def test_left_out_is_conditioning_without(case: Case) -> None:
         close(covariance[group][:, group], gone.numbers.with_noise(at.between(), gone.noise), 1e-6)
 
 
-def test_features_that_are_kept_are_those_anew(case: Case) -> None:
-    """Of rows that wait, by more rows: their covariance with these is known already."""
-    first, more, new = cut(case)
-    known = first.data.process(case.scales)
-    near, far = known.features(more.numbers.at), known.features(new.numbers.at)
-    cross, far_by_fields = near.by_fields_with(far), far.by_fields
-    both, last = near.followed_by(far, cross), torch.arange(len(more.data.x), len(more.data.x) + len(new.data.x))
-    close(both.rows(last).by_fields, far_by_fields, 1e-12)
-    close(both.by_fields, replace(both).by_fields, 1e-9)
-    after = known.given(more.numbers.rows(last - last[0]), more.noise[: len(last)], near.rows(last - last[0]))
-    given = more.numbers.rows(last - last[0]).there(cross[: len(last) * more.numbers.shape[1]])
-    for found in (after.features(far.at, far, given), after.features(far.at, far)):
-        anew = after.features(new.numbers.at)
-        close(found.known, anew.known, 1e-7)
-        close(found.by_fields, anew.by_fields, 1e-7)
-        close(found.between(), anew.between(), 1e-7)
-
-
 @pytest.mark.parametrize("size", [2.0, None])
 def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | None) -> None:
     E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)
@@ -238,9 +212,6 @@ def test_rows_without_noise_that_are_there_twice_are_refused() -> None:
     twice = one.part(torch.tensor([0, 0]))
     with pytest.raises(NumericalError, match="the covariance of the rows is not positive definite"):
         twice.data.prior(one.scales).given(twice.numbers, 0.0 * twice.noise)
-
-
-# --- digits -------------------------------------------------------------------------------------------------------
 
 
 def exactly(F: Tensor, S: Tensor, variance: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

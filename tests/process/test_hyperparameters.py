@@ -1,7 +1,5 @@
 """Scales of kernels, priors and noise: what they do to covariances, scales derived from them, and slopes by them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

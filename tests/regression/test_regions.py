@@ -1,7 +1,5 @@
 """The factor with which 95 % regions hold, from errors whose distribution is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

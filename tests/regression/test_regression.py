@@ -98,9 +98,6 @@ def fields_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(iterative, "NEGLIGIBLE_VARIANCE_RATIO", 1e-12)
 
 
-# --- covariances -------------------------------------------------------------------------------------------------
-
-
 def naive_gram(a: Linearisation, b: Linearisation) -> Tensor:
     """Prior covariance (M m, N m): block-diagonal effects around the kernels' matrices at all points."""
     total = a.sensitivity.flatten(0, 1) @ torch.diag(a.spec.prior_variance) @ b.sensitivity.flatten(0, 1).T
@@ -168,9 +165,6 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     torch.testing.assert_close(projected.rows(some).own_blocks(), blocks[some], rtol=1e-12, atol=1e-13)
     expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
     close(Process.of_rows(data, problem.noise).covariance(queries), expected, prior, 1e-10)
-
-
-# --- momenta -------------------------------------------------------------------------------------------------------
 
 
 def mode(found: Any, target: Tensor) -> Momenta:

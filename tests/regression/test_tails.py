@@ -74,9 +74,6 @@ def test_errors_of_no_size_or_of_any_size_do_no_harm() -> None:
         assert bool((tails.weights >= 0).all())
 
 
-# --- good or gross ------------------------------------------------------------------------------------------------
-
-
 def contaminated(share: float, size: float, dim: int, scale: float = 1.0, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Squares (200, 1) of errors whose good ones have the variance ``scale``, and which of them are gross."""
     errors, gross = simulated(200, dim, inf, scale**0.5, seed), torch.zeros(200, dtype=torch.bool)

@@ -1,19 +1,16 @@
 """Numbers of reports, against brute force and against the truth of the simulated arm."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, with_usual_scales
+from product_bank import Case
 from scipy.stats import chi2
 from table_bank import refused
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
@@ -185,25 +182,6 @@ def test_rows_of_the_fit_and_of_a_registration_are_left_out_of_new_rows(arm: Cas
     registered = arm.model.registered(shifted[:12])
     assert len(find(registered, shifted).predictions) == len(shifted) - 12
     assert not find(registered, shifted[:12]).new
-
-
-@pytest.mark.slow
-def test_models_with_control_points_and_with_outliers() -> None:
-    arm, train, test = simulated(60)
-    test = test[:100]
-    points = train.points.clone()
-    points[[3, 40]] += 0.004
-    data = dc.Measurements(train.q, points)
-    model = with_usual_scales(arm.nominal, data, controls=30).model
-    with pytest.raises(InputError, match="control points"):
-        find(model)
-    assert find(model, test).errors["calibrated"].rms == pytest.approx(dc.evaluate(model, test).rms)
-    found = find(model, data)
-    assert {3, 40} <= {one.row for one in found.outliers}
-    good = torch.ones(60, dtype=torch.bool)
-    good[[3, 40]] = False
-    rms = float(found.predictions.errors.rows(good).rms)
-    assert rms == pytest.approx(dc.evaluate(model, test).rms, rel=0.3)
 
 
 @pytest.mark.usefixtures("undrawn")

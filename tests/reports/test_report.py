@@ -1,7 +1,5 @@
 """The HTML report: complete, self-contained, small, and true to the numbers it was made from."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -15,11 +13,9 @@ from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings, find
-from diffeo_calib.reports.html.sections import record
 from diffeo_calib.reports.html.sentences import figures, verdict
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
@@ -56,14 +52,6 @@ def check_page(text: str) -> None:
         assert reference in ids, reference
     assert all(figure.get("aria-label") for figure in page.iter("figure"))
     assert all(len(figure.xpath(".//*[local-name()='path']")) > 3 for figure in page.iter("figure"))
-
-
-def test_the_record_holds_frames_in_full(posed: Case) -> None:
-    texts = [line.split(": ")[1].split() for line in record(posed.model, None).text if "rx ry rz" in line]
-    for text, frame in zip(texts, (posed.model.geometry.base, posed.model.measured_frame), strict=True):
-        numbers = torch.tensor(list(map(float, text)), dtype=torch.float64)
-        torch.testing.assert_close(numbers[:3], frame[:3, 3], rtol=0, atol=1e-7)
-        torch.testing.assert_close(rotation_matrices(numbers[None, 3:], "rotvec")[0], frame[:3, :3], rtol=0, atol=1e-7)
 
 
 def test_new_rows(arm: Case, tmp_path: Path) -> None:

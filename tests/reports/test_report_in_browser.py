@@ -1,7 +1,5 @@
 """The report in a real browser: nothing fails, nothing is loaded, everything is drawn, readable and reachable."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Machines with commanded poses or places: the identity as a chain, wherever the poses are."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy.spatial.transform import Rotation

@@ -101,11 +101,8 @@ EYE, MAPPING = torch.eye(4), "the mimic of joint 'j': expected a mapping from na
         ({"origin": bad_origin(nan, 0, 3)}, "not finite"),
         ({"origin": torch.eye(3)}, "`the origin of joint 'j'` has the wrong shape: expected (4, 4), got (3, 3)"),
         ({"axis": torch.zeros(3)}, "the axis of joint 'j': expected a non-zero vector"),
-        ({"axis": torch.full((3,), nan)}, "not finite"),
         ({"lower": 1.0, "upper": -1.0}, "the limits of joint 'j': expected lower <= upper"),
-        ({"lower": nan}, "the limits of joint 'j'"),
         ({"mimic": {"k": nan}}, "the multiplier of 'k' in joint 'j': expected a finite number, got nan"),
-        ({"mimic": {"k": "two"}}, "the multiplier of 'k' in joint 'j': expected a finite number, got 'two'"),
         *(({"mimic": wrong}, MAPPING) for wrong in ({}, "k", {3: 1.0})),
         *(
             ({"mimic": {"k": 1.0}, "mimic_offset": wrong}, f"mimic offset of joint 'j': expected a finite {ending}")

@@ -39,9 +39,6 @@ def unexplained(features: Tensor, values: Tensor) -> float:
     return float((features @ solution - values[:, None]).abs().max())
 
 
-# --- the compliances of a chain --------------------------------------------------------------------------------------
-
-
 @every_chain
 def test_merged_places_lose_nothing(chain: Chain) -> None:
     """The moment of a weight at any frame beyond a joint is in the span of the joint's features."""
@@ -63,9 +60,6 @@ def test_a_robot_without_lever_arms_has_no_sag() -> None:
     assert sag.compliances == ()
     assert sag.size == len(sag.joints) == len(sag.own) == 0
     assert GeometryMap(Geometry.nominal(chain), elastic=True).parameters == Geometry.nominal(chain).size
-
-
-# --- payloads of known mass -------------------------------------------------------------------------------------------
 
 
 MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)

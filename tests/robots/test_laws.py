@@ -1,7 +1,5 @@
 """Laws of every robot: poses of pinocchio, exact derivatives, descriptions that come back, the view from its tip."""
 
-from __future__ import annotations
-
 import json
 from math import pi
 from pathlib import Path
@@ -52,8 +50,6 @@ BODY = {name: load_urdf(URDF_FILE, *view) for name, view in VIEWS.items()}
 ROBOTS: dict[str, Tree] = {**CHAINS, "every mimic": CHAIN, "two arms": two_arms(), **BODY}
 every_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS.keys())
 
-
-# --- poses ----------------------------------------------------------------------------------------------------------
 
 FILES = {"crooked": ("world", "end"), "crooked from the middle": ("a", "end"), "lift": ("floor", "hand")}
 
@@ -154,9 +150,6 @@ def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: st
         dc.load_urdf(URDF_FILE, "pelvis", tips, loads)
 
 
-# --- derivatives ----------------------------------------------------------------------------------------------------
-
-
 @every_robot
 def test_jacobians_are_derivatives(robot: Tree) -> None:
     q = draw(3, robot.n)
@@ -184,9 +177,6 @@ def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: flo
     found = nominal.sensitivities(q, theta)
     assert_close(found, by_theta, rtol=1e-11, atol=1e-12)
     assert nominal.sag.start == nominal.sag.stop or float(found[..., nominal.sag].abs().max()) > 1e-3
-
-
-# --- gravity --------------------------------------------------------------------------------------------------------
 
 
 def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) -> Tensor:

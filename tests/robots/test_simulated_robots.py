@@ -48,9 +48,6 @@ def test_smooth_and_periodic(k0: Callable[[torch.Tensor], torch.Tensor]) -> None
         k0(torch.zeros(4, 3))
 
 
-# --- the simulated arm ------------------------------------------------------------------------------------------------
-
-
 def test_gravity_torques_agree_with_pinocchio(tmp_path: Path) -> None:
     pin = pytest.importorskip("pinocchio")
     arm = SimulatedArm(payload=6.0)

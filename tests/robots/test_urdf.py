@@ -39,8 +39,6 @@ def load(folder: Path, content: str | bytes, tip: str = "tool", base: str = "bas
     return load_urdf(file, base, tip)
 
 
-# --- what is read, and what is ignored ------------------------------------------------------------------------------
-
 JUNK = """<!-- comment --><?hint x?><xacro:include filename="x"/><gazebo><plugin name="p"/></gazebo>
     <material name="m"/><transmission name="t"><type>x</type></transmission><unheard_of a="b"><joint/></unheard_of>
     <sensor:camera name="c"/><material name="m"/>"""
@@ -96,13 +94,10 @@ FIXED = '<axis xyz="0 0 0"/><mimic joint="elbow"/><limit lower="1" upper="0"/>'
         (robot("<!-- a -- b -->" + GOOD), "ignored two hyphens inside a comment"),
         (
             robot(GOOD.replace(Z, Z + '<limit lower="1" upper="-1"/>')),
-            r"the limits of joint 'shoulder' \(lower 1, upper -1\); correct the file if",
+            r"limits of joint 'shoulder' \(lower 1, upper -1\)",
         ),
         (robot(GOOD.replace(Z, Z + '<limit lower="nan" upper="1"/>')), r"lower nan, upper 1"),
-        (
-            robot(GOOD.replace('<origin xyz="0 0.5', f'{FIXED}<origin xyz="0 0.5')),
-            "<mimic> of joint 'mount', which is fixed",
-        ),
+        (robot(GOOD.replace('<origin xyz="0 0.5', f'{FIXED}<origin xyz="0 0.5')), "<mimic> of joint 'mount'"),
     ],
 )
 def test_harmless_faults_are_ignored_with_a_warning(content: str, message: str, tmp_path: Path) -> None:
@@ -112,9 +107,6 @@ def test_harmless_faults_are_ignored_with_a_warning(content: str, message: str, 
     assert len(caught) == 1
     assert torch.equal(chain(Q), plain(Q))
     assert chain.limits.isinf().all()
-
-
-# --- faults that are explained --------------------------------------------------------------------------------------
 
 
 def one(kind: str = "revolute", inside: str = Z) -> str:
@@ -132,46 +124,30 @@ FAST = joint("k", "base_link", "upper_arm") + joint(
     ("text", "message"),
     [
         ("", "is not well-formed XML"),
-        ("plain words", "is not well-formed XML"),
         ("<robot name='r'><link name='a'>", "is not well-formed XML (line 1"),
-        (robot(GOOD.replace('name="elbow"', 'name="j" name="k"')), "is not well-formed XML"),
         ("<sdf/>", "is not a URDF: expected <robot> as its root element, got <sdf>"),
         ('<robot name="r" xmlns="x"><links/></robot>', "has no link 'base_link'"),
         (MACROS, "but macros that may make it; expand the xacro file first"),
         (robot("<link/>"), "a <link> in "),
-        (robot("<joint type='fixed'/>"), "a <joint> in "),
         (robot("<joint name='j'/>"), "has no attribute 'type'"),
         (robot("<joint name='j' type='fixed'><child link='tool'/></joint>"), "joint 'j' in "),
         (robot("<joint name='j' type='fixed'><parent/><child link='tool'/></joint>"), "<parent> of joint 'j'"),
         (robot(GOOD.replace("1 0 0", "1 0")), "expected 3 finite numbers, got '1 0'; correct the file"),
-        (robot(GOOD.replace("1 0 0", "1 0 nan")), "expected 3 finite numbers"),
         # a file that was not expanded is refused at once, not when another tip is chosen
         (
             robot(GOOD + joint("grip", "tool", "finger", "floating", '<origin xyz="${a} 0 0"/>')),
             "expand the xacro file first",
         ),
-        (one(inside='<limit lower="a" upper="1"/>'), "lower of <limit> of joint 'j'"),
         (one(inside='<mimic joint="k" offset="much"/>'), "offset of <mimic> of joint 'j' in "),
-        (one(inside='<mimic joint="k" multiplier="inf"/>'), "expected a finite number, got 'inf'; correct the file"),
         (robot(FAST), "the multiplier of 'k' in joint 'j': expected a number of at most 1e+06, got 1e+200"),
         (one(inside='<mimic joint="k"/>'), "mimics 'k', which is not a joint between 'base_link' and 'tool'; choose a"),
         (robot(GOOD + joint("again", "base_link", "tool")), "has two parent joints ('mount' and 'again')"),
         (robot(joint("j", "base_link", "forearm") + joint("j", "forearm", "tool")), "several joints named ['j']"),
         (one("fixed"), "has no moving joint from 'base_link' to 'tool'"),
         (one("floating"), "the type of joint 'j' in "),
-        (one("planar"), "got 'planar'; choose a base and a tip"),
-        (one("hinge"), "got 'hinge'"),
         (one(inside='<axis xyz="0 0 0"/>'), "the axis of joint 'j': expected a non-zero vector"),
-        (one(inside='<axis xyz="0 inf 0"/>'), "xyz of <axis> of joint 'j'"),
-        (one(inside='<origin xyz="0 0 1e308"/>'), "the origin of joint 'j'"),
-        (
-            robot(joint("a", "base_link", "upper_arm")),
-            "are not connected in '{}': got 'base_link' below 'base_link', 'tool' below",
-        ),
-        (
-            robot(joint("a", "upper_arm", "tool") + joint("b", "tool", "upper_arm")),
-            "make a loop: got the path tool <- upper_arm <- tool",
-        ),
+        (robot(joint("a", "base_link", "upper_arm")), "are not connected in '{}': got 'base_link' below"),
+        (robot(joint("a", "upper_arm", "tool") + joint("b", "tool", "upper_arm")), "loop: got the path tool <-"),
     ],
 )
 def test_bad_files_are_explained(tmp_path: Path, text: str, message: str) -> None:

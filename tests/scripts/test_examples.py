@@ -1,7 +1,5 @@
 """The guides run as they are, from another folder and without a warning."""
 
-from __future__ import annotations
-
 import runpy
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Fetching the public UR10 data: everything but the network."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -23,23 +23,17 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
+# Rows of the search, starts of zeros without a change of sign, starts that go on, and equivalents made plain.
 ROWS, ZEROS, KEPT, EXAMINED = 24, 64, 64, 8
-"""Rows of the search, starts of zeros without a change of sign, starts that go on, and equivalents made plain."""
 FIRST_STEPS, STEPS, LAST_STEPS = 5, 20, 6
-LARGEST_STEP, MARKER_M = 0.7, 0.5
-"""Of joints [rad or m], and of the marker on the tip [m]."""
-PROMISING = 0.02
-"""Share of the spread that is left in an affine frame by what is examined further."""
+LARGEST_STEP, MARKER_M = 0.7, 0.5  # of joints, rad or m, and of the marker on the tip, m
+PROMISING = 0.02  # share of the spread that is left in an affine frame by what is examined further
+# A plainer value is right if it leaves no more than this share, or this multiple of what the best one leaves.
 NICE, KEEPS = 0.015, 3.0
-"""A plainer value is right if it leaves no more than this share, or this multiple of what the best one leaves."""
-SMALLEST_LIMIT = 0.001
-"""Of the share that a convention may leave: rows that the robot explains need none."""
-LEAST_PART, MOST_PART = 0.04, 2.2
-"""Of a joint's limits, within which its values lie in the right unit."""
-LARGEST_PERCENT = 101.0
-"""Values from which joints are not -100..100 or 0..100 of their limits."""
-RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))
-"""Of gears, the usual ones first."""
+SMALLEST_LIMIT = 0.001  # of the share that a convention may leave: rows that the robot explains need none
+LEAST_PART, MOST_PART = 0.04, 2.2  # of a joint's limits, within which its values lie in the right unit
+LARGEST_PERCENT = 101.0  # from which values are not -100..100 or 0..100 of the limits
+RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))  # of gears, the usual ones first
 RIGHT_ANGLES = {1.0: "+pi/2", -1.0: "-pi/2", 2.0: "+pi"}
 
 
@@ -127,7 +121,7 @@ def conventions(
             skipped = len(kept) == EXAMINED or any(torch.equal(pattern, candidate) for candidate in kept)
             if not skipped and judged(starts.matrix[row], starts.offset[row]).left < limit:
                 kept.append(pattern)
-                yield _Starts(*(part[row : row + 1] for part in starts))
+                yield starts.some(slice(row, row + 1))
 
     first = next((candidate for starts in search.tried() for candidate in rigid(search.best(starts))), None)
     plain = [] if first is None else [search.plainer(candidate) for candidate in rigid(search.equivalents(first))]
@@ -146,35 +140,36 @@ class _Starts(NamedTuple):
     scaled: Tensor
     share: Tensor
 
+    def some(self, rows: Tensor | slice) -> _Starts:
+        """Some of them."""
+        return _Starts(*(part[rows] for part in self))
 
-@dataclass(frozen=True, eq=False)
+    @staticmethod
+    def joined(parts: list[_Starts]) -> _Starts:
+        """All of them."""
+        return _Starts(*map(torch.cat, zip(*parts, strict=True)))
+
+
 class _Search:
     """The search over rows q (N, n), as read, of the tip with this number; see :func:`conventions`."""
 
-    robot: Tree
-    tip: int
-    q: Tensor
-    projector: Tensor
-    per_rad: float
-
-    @property
-    def turning(self) -> Tensor:
-        """(n,) boolean."""
-        return torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
-
-    @property
-    def room(self) -> Tensor:
-        """(n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]."""
-        limits = self.robot.limits
+    def __init__(self, robot: Tree, tip: int, q: Tensor, projector: Tensor, per_rad: float) -> None:
+        self.robot, self.tip, self.q, self.projector, self.per_rad = robot, tip, q, projector, per_rad
+        self.turning, limits = torch.tensor(robot.periodic, dtype=torch.bool, device=HOST), robot.limits
         half = torch.where(self.turning, pi, 1.0).to(limits)[:, None]
         bounded = limits.isfinite() & (limits[:, 1:] > limits[:, :1])
-        return torch.where(bounded, limits, torch.cat([-half, half], 1))
+        # (n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]
+        self.room = torch.where(bounded, limits, torch.cat([-half, half], 1))
+        self.width = self.room[:, 1] - self.room[:, 0]
+        # -100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read
+        ticks = [2 * pi / 2**k * per_rad for k in range(8, 25)]
+        plain = [value * torch.ones_like(self.width) for value in (pi / 180, 180 / pi, *ticks)]
+        self.factors = [self.width / 200.0 * per_rad, self.width / 100.0 * per_rad, *plain]
 
     def tried(self) -> Iterator[_Starts]:
         """Starts: signs and zeros; exchanged or coupled columns; other units of all joints, and of some."""
-        n, turning = self.robot.n, self.turning
+        n, turning, width = self.robot.n, self.turning, self.width
         identity, span = torch.eye(n, dtype=torch.float64, device=HOST), self.q.amax(0) - self.q.amin(0)
-        width = self.room[:, 1] - self.room[:, 0]
         large = turning & (span > MOST_PART * width)
         small = turning & (span < LEAST_PART * width)
         if not bool(large.any()):
@@ -187,11 +182,11 @@ class _Search:
                 coupled[k + 1, k] = sign
                 mixed.append(self.starts(coupled, self.zeros(4), 3))
         if not bool(large.any()) and mixed:
-            yield _joined(mixed)
+            yield _Starts.joined(mixed)
         strange = bool((large | small | ~turning).all())
         percent = bool(((self.q * self.per_rad)[:, turning].abs() <= LARGEST_PERCENT).all())
         moving = turning & (span > gates.FIXED_RANGE)
-        for number, factor in enumerate(self.factors() if bool(turning.any()) else ()):
+        for number, factor in enumerate(self.factors if bool(turning.any()) else ()):
             part = (factor * span / width)[moving]
             possible = strange or (percent and number < 2)
             if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
@@ -203,13 +198,6 @@ class _Search:
                 grid = torch.rand(starts.offset.shape, generator=seeded(1), dtype=torch.float64, device=HOST)
                 size = torch.where(odd, 0.08 * 12.0**grid * width / span.clamp(min=1e-9), 1.0)
                 yield starts._replace(matrix=starts.matrix * size[..., None], scaled=odd.expand_as(starts.offset))
-
-    def factors(self) -> list[Tensor]:
-        """-100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read."""
-        width = self.room[:, 1] - self.room[:, 0]
-        ticks = [2 * pi / 2**k * self.per_rad for k in range(8, 25)]
-        plain = [value * torch.ones_like(width) for value in (pi / 180, 180 / pi, *ticks)]
-        return [width / 200.0 * self.per_rad, width / 100.0 * self.per_rad, *plain]
 
     def zeros(self, count: int) -> Tensor:
         """None, the middle of the limits, half a turn, the lower limits, and random right angles: (count, n)."""
@@ -236,9 +224,9 @@ class _Search:
     def best(self, starts: _Starts) -> _Starts:
         """The most promising, improved; the best first."""
         starts = self.improved(starts, FIRST_STEPS)
-        improved = self.improved(_chosen(starts, starts.share.argsort()[:KEPT]), STEPS)
+        improved = self.improved(starts.some(starts.share.argsort()[:KEPT]), STEPS)
         order = improved.share.argsort()
-        return _chosen(improved, order[improved.share[order] < PROMISING])
+        return improved.some(order[improved.share[order] < PROMISING])
 
     def equivalents(self, start: _Starts) -> _Starts:
         """One of the starts (1,), and those with other signs and half turns that explain as much, few signs first."""
@@ -249,39 +237,37 @@ class _Search:
         bare = start.matrix[0] * torch.where(start.matrix[0].diagonal() < 0.0, -1.0, 1.0)[:, None]
         starts = self.starts(bare, zeros, fewer=False)
         tried = self.improved(starts._replace(scaled=start.scaled.expand_as(starts.offset)), 2)
-        tried = self.improved(_chosen(tried, tried.share < PROMISING + float(start.share)), FIRST_STEPS)
-        good = _chosen(tried, tried.share < max(NICE, KEEPS * float(start.share)))
-        return _joined([good, start])
+        tried = self.improved(tried.some(tried.share < PROMISING + float(start.share)), FIRST_STEPS)
+        good = tried.some(tried.share < max(NICE, KEEPS * float(start.share)))
+        return _Starts.joined([good, start])
 
     def plainer(self, start: _Starts) -> tuple[Tensor, Tensor]:
         """M and b of one of the starts (1,), with known factors and the plainest zeros that explain as much."""
-        limit, factors = max(NICE, KEEPS * float(start.share)), self.factors()
+        limit, ones = max(NICE, KEEPS * float(start.share)), torch.ones_like(self.width)
         identity = torch.eye(self.robot.n, dtype=torch.bool, device=HOST)
-        usual = torch.stack([*factors, *(torch.ones_like(factors[0]) / ratio for ratio in (1, *RATIOS))])
+        usual = torch.stack([*self.factors, *(ones / ratio for ratio in (1, *RATIOS))])
         for k in start.scaled[0].nonzero()[:, 0].tolist():
             near = usual[(usual[:, k] / start.matrix[0, k].abs().max() - 1.0).abs() < 0.05, k]
-            tried = _joined([start] * max(len(near), 1))
+            tried = _Starts.joined([start] * max(len(near), 1))
             if len(near):
                 matrix = torch.where(identity[k][:, None], tried.matrix.sign() * near[:, None, None], tried.matrix)
                 start = self._taken(start, tried._replace(matrix=matrix, scaled=tried.scaled & ~identity[k]), limit)
         for k in range(self.robot.n):
             ends = [float(self.room[k].mean()), *self.room[k].tolist()]
             nice = [0.0, *([pi / 2, -pi / 2, pi] if bool(self.turning[k]) else []), *ends]
-            tried = _joined([start] * len(nice))
+            tried = _Starts.joined([start] * len(nice))
             values = torch.tensor(nice, dtype=torch.float64, device=HOST)[:, None]
             offset = torch.where(identity[k], values, tried.offset)
             start = self._taken(start, tried._replace(offset=offset, free=tried.free & ~identity[k]), limit)
-        turned = pi - (pi - start.offset[0]).remainder(2 * pi)
-        rounded = torch.where(
-            self.turning, turned.rad2deg().round(decimals=1).deg2rad(), start.offset[0].round(decimals=4)
-        )
+        turned = (pi - (pi - start.offset[0]).remainder(2 * pi)).rad2deg().round(decimals=1).deg2rad()
+        rounded = torch.where(self.turning, turned, start.offset[0].round(decimals=4))
         return start.matrix[0], torch.where(start.free[0], rounded, start.offset[0])
 
     def _taken(self, now: _Starts, tried: _Starts, limit: float) -> _Starts:
         """The first that leaves little and about as little as the best of them, else what there was."""
         tried = self.improved(tried, LAST_STEPS)
         good = (tried.share < min(limit, 1.5 * max(float(tried.share.min()), NICE / 3))).nonzero()[:1, 0]
-        return _chosen(tried, good) if len(good) else now
+        return tried.some(good) if len(good) else now
 
     def improved(self, starts: _Starts, steps: int) -> _Starts:
         """Damped least squares in the zeros, the sought factors and the marker's place on the tip."""
@@ -321,11 +307,3 @@ class _Search:
         residual, spread = self.projector @ p, (p - p.mean(1, keepdim=True)).square().sum((1, 2))
         share = (residual.square().sum((1, 2)) / spread.clamp(min=1e-12)).sqrt()
         return [residual, slopes, end[:, :3, :3].unflatten(0, shape), share]
-
-
-def _chosen(starts: _Starts, rows: Tensor) -> _Starts:
-    return _Starts(*(part[rows] for part in starts))
-
-
-def _joined(parts: list[_Starts]) -> _Starts:
-    return _Starts(*map(torch.cat, zip(*parts, strict=True)))

@@ -30,16 +30,11 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class SampledRows(NamedTuple):
-    """N rows that stand for all, beside a model.
+    """N rows that stand for all, beside a model."""
 
-    Args:
-        index: (N,) their numbers among all. process: what is known by them, of M numbers.
-        basis: (N, m, r) of what poses tell, see :class:`TangentData`; None where rows tell their coordinates.
-    """
-
-    index: Tensor
-    process: Process
-    basis: Tensor | None
+    index: Tensor  # (N,) their numbers among all
+    process: Process  # what is known by them, of M numbers
+    basis: Tensor | None  # (N, m, r) of what poses tell, see :class:`TangentData`; None where rows tell coordinates
 
     @classmethod
     def of(cls, data: TangentData, scales: Hyperparameters) -> tuple[SampledRows, TangentData]:
@@ -143,9 +138,7 @@ def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
         eye = torch.eye(3, dtype=away.dtype, device=away.device)
         for axis, unit in zip("xyz", eye, strict=True):
             yield Hypothesis(f"the scale of the measuring frame along {axis}", effects(away * unit), PERCENT, OF_AXIS)
-    chain = geometry.chain
-    q = data.x - data.x.mean(0)
-    ratio = {"unit": PERCENT, "usual": gates.USUAL_RATIO}
+    chain, q, ratio = geometry.chain, data.x - data.x.mean(0), {"unit": PERCENT, "usual": gates.USUAL_RATIO}
     for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
         if not turns and any(chain.periodic):  # a machine of slides alone is judged by the axes of its places
             along = data.jacobian[..., joint, None] * q[:, joint, None, None]
@@ -154,8 +147,7 @@ def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
         if name not in chain.joint_names:
             place = 6 + 6 * joint + 3 * bool(chain.revolute[joint])
             moved = data.sensitivities[..., place : place + 3] @ chain.axes[joint].to(q)
-            value = q @ chain.coupling[joint].to(q)
-            along = (moved * value[:, None])[..., None]
+            along = (moved * (q @ chain.coupling[joint].to(q))[:, None])[..., None]
             yield Hypothesis(f"the multiplier of {name}", along, fix=OF_MIMIC, **ratio)
 
 
@@ -171,25 +163,18 @@ def links_of(data: TangentData) -> Iterator[Hypothesis]:
             yield Hypothesis(f"the link before {name} ({1e3 * length:.4g} mm)", effects, fix=OF_LINK)
 
 
-LEAST_OWN = 1e-6
-"""Part of what rows say of a length that must be left beside links of any size, else they tell nothing of it."""
+LEAST_OWN = 1e-6  # part of what rows say of a length that must be left beside links of any size
 
 
 class Length(NamedTuple):
-    """A length against what it is said to be.
-
-    Args:
-        cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
-            it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
-        taken_up: whether it is surely the robot's, and so part of the fit.
-    """
+    """A length against what it is said to be."""
 
     cause: Hypothesis
-    value: float
+    value: float  # how much it differs, in m or relative
     deviation: float
-    motion: float
-    unnoticed: float
-    taken_up: bool
+    motion: float  # RMS motion of a point by a unit of it, m
+    unnoticed: float  # largest value that a usual robot shows by chance, and that passes without a warning
+    taken_up: bool  # whether it is surely the robot's, and so part of the fit
 
     @property
     def gain(self) -> float:
@@ -256,20 +241,18 @@ def warn_of_lengths(judged: list[Length]) -> float | None:
         return None
     worst = max(wrong, key=lambda length: length.gain)
     moved = max((abs(length.value) * length.motion for length in wrong if not length.taken_up), default=None)
-    text = sentence(
-        f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
-        expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
-        got=None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
-        fix=worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None),
-    )
-    warn_user(text)
+    what = f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be"
+    expected = f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong"
+    got = None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS"
+    fix = worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None)
+    warn_user(sentence(what, expected=expected, got=got, fix=fix))
     return moved
 
 
 # --- what differs from row to row -------------------------------------------------------------------------------------
 
+# RMS motions of the points by unknowns of which the size is sought.
 VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
-"""RMS motions of the points by unknowns of which the size is sought."""
 
 
 def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:

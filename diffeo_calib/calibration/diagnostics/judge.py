@@ -42,10 +42,8 @@ from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Hypothesis
 
-ROUNDS = 20
-"""Of the codes of a mixture."""
-MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
-"""Factors of payloads in another unit, or with a wrong digit: g, pounds."""
+ROUNDS = 20  # of the codes of a mixture
+MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)  # payloads with a wrong digit, in g, in pounds
 ONE_SET_UP = "one set-up for all rows, in the order of their numbers"
 NOTHING = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
 OPENED_M = 0.01
@@ -59,12 +57,11 @@ SLOW = (
 
 
 class Candidate(NamedTuple):
-    """An explanation that chance does not explain, in words, and the unknowns that it opens.
+    """An explanation that chance does not explain, in words.
 
     Args:
-        left, most: parts of the RMS left-out error that remain with them, and that may remain. opens: rows for which
-            the model holds, those without effects, once they are opened in it; none if not. columns: (M, U) their
-            effects on the numbers of the rows, of any size.
+        left, most: parts of the RMS left-out error that remain with it, and that may remain. columns: (M, U) effects of
+            unknowns of any size that it opens. opens: the rows for which the model then holds; none if it is not to.
     """
 
     what: str
@@ -77,15 +74,11 @@ class Candidate(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """The best explanation in a sentence.
-
-    Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
-    A wrong column of the table explains wrong rows, too.
-    """
+    """The best explanation in a sentence."""
 
     text: str
-    columns: Tensor | None
-    of_table: bool
+    columns: Tensor | None  # (N, R, U) effects, m, of unknowns of unit variance that the model shall have
+    of_table: bool  # whether a column of the table is wrong, which explains wrong rows, too
 
 
 def judge(
@@ -127,10 +120,8 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
     if best is None or best.left > best.most:
         return None
     moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
-    got = (
-        f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * best.left:.0f} % beside it"
-    )
     fix, columns = best.fix, None
+    got = f"about {1e3 * moved:.2g} mm of error; leave-one-out errors fall to {100 * best.left:.0f} % beside it"
     if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
@@ -142,108 +133,87 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
 
 
 class Change(NamedTuple):
-    """A hypothesis from a row on, or drifting over all rows.
-
-    Args:
-        hypothesis: with effects (N, R, U). codes: (N,) of the rows, see above. size: (U,) unknowns, of a drift between
-            the first row and the last. gain: what it explains. row: the first one after a change, in the order of
-            measurement; None for a drift.
-    """
+    """A hypothesis from a row on, or from two, or drifting over all rows."""
 
     hypothesis: Hypothesis
-    codes: Tensor
-    size: Tensor
-    gain: float
-    row: int | None
+    columns: Tensor  # (M, U) effects on the numbers of the rows
+    size: Tensor  # (U,) unknowns, of a drift between the first row and the last
+    evidence: float  # gain less the price of unknowns and rows by the Bayesian information criterion
+    gain: float  # what it explains
+    rows: tuple[int, ...]  # the first ones after a change, in the order of measurement; none of a drift
 
-    @property
-    def evidence(self) -> float:
-        """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
-        return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.codes))
+    @classmethod
+    def of(
+        cls, cause: Hypothesis, process: Process, codes: Sequence[Tensor], rows: Sequence[int], excess: float
+    ) -> Change:
+        """With codes (N,) of the rows, see above; gains are divided by ``excess``, or by what is left unexplained."""
+        columns = torch.cat([process.numbers.of_table(code[:, None, None] * cause.effects) for code in codes], 1)
+        evidence = Evidence.of(columns, process)
+        gain, unknowns = float(evidence.gain) / max(excess, float(evidence.excess)), columns.shape[1] + len(rows)
+        return cls(cause, columns, evidence.size, gain - unknowns * log(len(codes[0])), gain, tuple(sorted(rows)))
 
     def words(self, rows: SampledRows) -> str:
         """Phrase for the change and its size."""
-        name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
-        if self.hypothesis.unit is not None:
-            verb = verb if self.row is None else "to have changed"
-            return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
-        distances = rows.distances(self.hypothesis.effects, self.size)
-        typical = distances[distances.amax(1) > 0].median(0).values
-        distance = float(typical[typical > 0].median())
-        if name == MARKERS and rows.basis is None:
-            distance = float(typical.max())
-            single = float(typical.min()) < gates.OTHER_MARKERS * distance
-            name = f"marker {int(typical.argmax())}" if single else name
-        return f"{name} seems {verb} by about {self.hypothesis.amount(distance)}"
+        name, E, unit, *_ = self.hypothesis
+        if len(self.rows) > 1:
+            return f"{name} seems to have moved more than once,"
+        verb = f"to have {'moved' if unit is None else 'changed'}" if self.rows else "to drift"
+        size = float(self.size.abs().max())
+        if unit is None:
+            distances = rows.distances(E, self.size)
+            size = float(distances[distances.amax(1) > 0].median(0).values.max())  # of the marker that moved most
+        return f"{name} seems {verb} by about {self.hypothesis.amount(size)}"
+
+    def candidate(self, rows: SampledRows, names: Sequence[str], others: Sequence[Change] = ()) -> Candidate:
+        """Explain the rows; names of rows in the order of measurement; others that explain as much."""
+        words = ", or ".join(dict.fromkeys(change.words(rows) for change in (self, *others)))
+        words += " (these rows do not tell which)" * bool(others)
+        words += f" near {' and '.join(names[row] for row in self.rows)}" if self.rows else " over the rows"
+        kept = ("the middle of the rows", "the rows before it", "the rows before them")[len(self.rows)]
+        fix = f"check what happened then; {self.hypothesis.fix}" if self.rows else SLOW
+        left, most = rows.left(self.columns), gates.WORTH ** max(len(self.rows), 1)
+        return Candidate(words, ONE_SET_UP, fix, left, most, kept, self.columns)
 
 
 def changed(
     rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, names: Sequence[str], *, excess: float = 1.0
 ) -> Iterator[Candidate]:
-    """The clearest change during the measurements; arguments as of :func:`changes` and :func:`judge`."""
-    process, order = rows.process, lines.argsort()
-    tried = [*changes(hypotheses, process, order, excess=excess)]
+    """The clearest change during the measurements, and clear ones from two rows on; arguments as of :func:`judge`.
+
+    Three set-ups look like a drift, and what moves back looks like little.
+    """
+    order = lines.argsort()
+    tried, in_order = [*changes(hypotheses, rows.process, order, excess)], [names[row] for row in order.tolist()]
     best = max(tried, key=lambda change: change.evidence)
-    what, _, _, advice, *_ = best.hypothesis
-    sudden, clear = best.row is not None, best.evidence >= gates.CHANGE_EVIDENCE
-    once, fix = sudden * max(best.evidence, 0.0), f"check what happened then; {advice}"
+    what, clear = best.hypothesis.name, best.evidence >= gates.CHANGE_EVIDENCE
+    least = gates.CHANGE_EVIDENCE + max(best.evidence, 0.0) * bool(best.rows)
     for cause in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
-        yield from changed_twice(rows, cause, order, names, once, excess=excess)
-    if not clear:
-        return
-    others = [
-        change
-        for change in tried
-        if (change.row is not None) == sudden
-        and change.hypothesis.name != what
-        and min(best.gain - change.gain, best.evidence - change.evidence) < gates.CHANGES_TOLD_APART
-    ]
-    words = ", or ".join(dict.fromkeys(change.words(rows) for change in (best, *others)))
-    words += " (these rows do not tell which)" * bool(others)
-    words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
-    kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
-    columns = rows.columns(best.hypothesis.effects, best.codes)
-    yield Candidate(words, ONE_SET_UP, advice, rows.left(columns), gates.WORTH, kept, columns)
+        twice = changed_twice(cause, rows.process, order, excess)
+        if twice.rows[1] - twice.rows[0] >= gates.CHANGE_ROWS and twice.evidence >= least:
+            yield twice.candidate(rows, in_order)
+    if clear:
+        alike = [each for each in tried if bool(each.rows) == bool(best.rows) and each.hypothesis.name != what]
+        falls = [min(best.gain - other.gain, best.evidence - other.evidence) for other in alike]
+        others = [other for other, fall in zip(alike, falls, strict=True) if fall < gates.CHANGES_TOLD_APART]
+        yield best.candidate(rows, in_order, others)
 
 
-def changed_twice(
-    rows: SampledRows, hypothesis: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
-) -> Iterator[Candidate]:
-    """Three set-ups, which look like a drift, or what moves back, which looks like little.
-
-    Each change is sought once more beside the other one. ``once``: evidence of a single one; others as of
-    :func:`changes`.
-    """
-    (what, E, _, advice, *_), process = hypothesis, rows.process
-    first, second = _likeliest(*scans([E], process, order)), 0
+def changed_twice(cause: Hypothesis, process: Process, order: Tensor, excess: float) -> Change:
+    """A hypothesis from its two most likely rows on: each is sought once more beside the other one."""
+    first, second = _likeliest(*scans([cause.effects], process, order)), 0
     for _ in range(2):
-        beside = process.opened(rows.columns(E, _from(order, first)))
-        first, second = _likeliest(*scans([E], beside, order)), first
-    columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
-    both = Evidence.of(columns, process)
-    evidence = float(both.gain) / max(excess, float(both.excess)) - (columns.shape[1] + 2) * log(len(order))
-    if abs(first - second) >= gates.CHANGE_ROWS and evidence >= once + gates.CHANGE_EVIDENCE:
-        near = " and ".join(names[order[row]] for row in sorted((first, second)))
-        words, fix = f"{what} seems to have moved more than once, near {near}", f"check what happened then; {advice}"
-        yield Candidate(words, ONE_SET_UP, fix, rows.left(columns), gates.WORTH**2, "the rows before them", columns)
+        beside = process.opened(process.numbers.of_table(cause.effects * _from(order, first)[:, None, None]))
+        first, second = _likeliest(*scans([cause.effects], beside, order)), first
+    return Change.of(cause, process, [_from(order, row) for row in (first, second)], (first, second), excess)
 
 
-def changes(
-    hypotheses: Sequence[Hypothesis], process: Process, order: Tensor, *, excess: float = 1.0
-) -> Iterator[Change]:
-    """Every hypothesis from its most likely row on, and drifting.
-
-    Gains are divided by ``excess``, or by the mean square of what is left unexplained where that is larger.
-    ``order``: (N,) row numbers in the order of measurement.
-    """
+def changes(hypotheses: Sequence[Hypothesis], process: Process, order: Tensor, excess: float = 1.0) -> Iterator[Change]:
+    """Every hypothesis from its most likely row on, and drifting; ``order``: (N,) rows in the order of measurement."""
     ramp = order.argsort().to(process.mu) / (len(order) - 1) - 0.5
     for cause, scan in zip(hypotheses, scans([cause.effects for cause in hypotheses], process, order), strict=True):
         row = _likeliest(scan)
-        jump = scan._replace(g=scan.g[row], H=scan.H[row])
-        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * cause.effects), process)
-        for evidence, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
-            gain = float(evidence.gain) / max(excess, float(evidence.excess))
-            yield Change(cause, codes, evidence.size, gain, first)
+        yield Change.of(cause, process, [_from(order, row)], [row], excess)
+        yield Change.of(cause, process, [ramp], [], excess)
 
 
 def scans(effects: Sequence[Tensor], process: Process, order: Tensor) -> Iterator[Evidence]:

@@ -1,26 +1,31 @@
-"""Rows beside a finished model: are their errors those of a calibrated robot, and what explains them otherwise?
+"""Rows beside a model: which of them look wrong, why, and whether their errors are those of a calibrated robot.
 
 Explanations are asked in turn, the first that holds is named: joints of other lines, a device or marker that moved,
 another reading of the table, a wrong unit, a block of wrong rows, single wrong rows, a change since the fit.
+
+A column in which a device reports one value may be right: the height of a planar robot, the gauge of a ball that
+touches a surface. It is wrong where the robot moves what the column tells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import degrees, inf, radians
+from math import degrees, inf, log, radians
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, flagged
+from diffeo_calib.calibration.diagnostics.likely_mistakes import Step, best_run, out_of_step
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
-from diffeo_calib.calibration.diagnostics.row_order import Step, find_block, out_of_step
-from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.calibration.identification.registration import spread
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST, outside_inference_mode
+from diffeo_calib.common.errors import MOST_NAMES, InputError, MeasurementError, few, printable, sentence, warn_user
+from diffeo_calib.common.quantiles import above_estimated, chi2_above, chi2_median, known, largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, positions_of, predicted_at, residuals
 from diffeo_calib.kinematics.nominal import FlangePoints
@@ -30,12 +35,229 @@ from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import Places, sensor_of
+from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.tables import Coordinates, divided
+from diffeo_calib.sensors.tables import divided
 
+FAR = "far from where the other rows predict it"
+MAX_MARKERS_FOR_EXCHANGE, MOST_OUTLIERS = 12, 10
+"""Number of markers up to which exchanged pairs are looked for, and most lines about single rows."""
 MOST_ROWS, MOST_EXPECTED = 500, 100
 """Rows that are looked at, and those of them in which the typical expected error is found."""
+OF_DEVIATIONS = "std_"
+"""Prefix of columns of known standard deviations, which may well be equal."""
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A measurement that deviates from its prediction by more than noise explains.
+
+    Args:
+        row: number of the row in the measurements.
+        marker: number of the marker; None if there is only one, or if poses were measured.
+        number: line of the row in its file, see :attr:`Measurements.line_numbers`. name: of the row, in words.
+        distance: from its prediction by all other rows, m; of readings in m at the tool.
+        weight: its weight in the fit, about 1 for inliers; None if it took no part in the fit.
+        reason: probable cause, in words.
+        tip: name of the tip, of poses on several; else None.
+        reading: what a reading is off by in its own unit, and this unit; None for measured positions.
+    """
+
+    row: int
+    marker: int | None
+    number: int
+    name: str
+    distance: float
+    weight: float | None
+    reason: str
+    tip: str | None = None
+    reading: tuple[float, str] | None = None
+
+    @property
+    def shown(self) -> tuple[float, str]:
+        """Size of the error, and its unit."""
+        return self.reading or (1e3 * self.distance, "mm")
+
+
+def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
+    if outliers:
+        kept, count = "" if outliers[0].weight is None else "; none was dropped", len({each.row for each in outliers})
+        yield f"{count} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
+    for outlier in outliers[:MOST_OUTLIERS]:
+        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        marker = f", {printable(outlier.tip)}" if outlier.tip is not None else marker
+        weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
+        size, unit = outlier.shown
+        yield f"  {printable(outlier.name)}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
+    if len(outliers) > MOST_OUTLIERS:
+        yield f"  and {len(outliers) - MOST_OUTLIERS} more"
+
+
+def excluded(
+    squares: Tensor, freedom: Tensor, *, least: float = 1.0, factor: float = 1.0, by_others: bool = True
+) -> Tensor:
+    """Which squared distances (N, bodies) are too large by chance, or beside most of the others.
+
+    In units of a variance that is estimated from n numbers, the largest square of clean rows is that of an F ratio and
+    not of chi-squared: twice as large with n = 30. Their median knows the variance half as well as all of them.
+
+    Args:
+        freedom: (N, bodies) of each. least: smallest size of the errors in units of what the model expects.
+        factor: by which an error must exceed what chance explains. by_others: whether the others tell how large errors
+            are, and not the model.
+    """
+    present, level = ~squares.isnan(), gates.OUTLIER_CHANCE / len(known(squares))
+    kinds = freedom[present].unique().tolist()
+    size = torch.cat([squares[present & (freedom == k)] / chi2_median(k) for k in kinds]).median()
+    lower, limits = gates.MEDIAN_EFFICIENCY * float(freedom[present].sum()), torch.zeros_like(squares)
+    for k in kinds:
+        limits[freedom == k] = above_estimated(level, k, lower) if by_others else chi2_above(level, k)
+    return squares > factor**2 * size.clamp(min=least) * limits
+
+
+def outliers(
+    model: CalibratedKinematics, placed: Any, tangent_data: TangentData, left_out: LeaveOneOut, least: float = 1.0
+) -> list[Outlier]:
+    """Measurements further from their prediction than noise explains, the worst first.
+
+    Args:
+        model: the calibrated model, which helps to find the causes.
+        placed: the rows, as :func:`placing.place.place` finds them. tangent_data: the same, with their weights.
+        left_out: their leave-one-out errors. least: see :func:`excluded`.
+    """
+    noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
+    bad = excluded(squares, noise.of_freedom(float, squares), least=least)
+    each = left_out.errors.unflatten(1, (noise.bodies, -1))
+    distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
+    outlying = []
+    if placed.coordinates is not None:
+        table, rows = placed.coordinates
+        suspects = found_outliers(model, table, bad[rows], distances[rows], weights[rows])
+        outlying += [replace(outlier, row=int(rows[outlier.row])) for outlier in suspects]
+    for kind in placed.readings:
+        data, sizes = kind.data, each[kind.rows, 0].nan_to_num(0.0).norm(dim=1).tolist()
+        shown, balls = errors_of_kinds(left_out.errors, None, [kind]).main, model.at_payloads(data.payload)(data.q)
+        unit, per_unit = shown.shown
+        for k in bad[kind.rows, 0].nonzero()[:, 0].tolist():
+            row, reading = int(kind.rows[k]), (per_unit * float(shown.errors[k, 0]), unit)
+            of_row = row, None, int(data.line_numbers[k]), data.row_names[k], sizes[k], float(weights[row, 0])
+            reason = kind.reason(balls[k, -1].detach(), gates.REMAINING_ERROR * sizes[k])
+            outlying.append(Outlier(*of_row, reason, reading=reading))
+    return sorted(outlying, key=lambda outlier: -outlier.distance)
+
+
+def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
+    """Measurements that took no part in a fit and that its model excludes, the worst first.
+
+    Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
+    """
+    predicted = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+    errors = data.bodies.errors(data, predicted.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
+    squares = (errors * torch.linalg.solve(predicted.covariance, errors[..., None])[..., 0]).sum(-1)
+    freedom = torch.full_like(squares, errors.shape[-1])
+    bad = excluded(squares, freedom, factor=gates.OVERCONFIDENT, by_others=False)
+    return found_outliers(model, data, bad, errors[..., :3].norm(dim=-1))
+
+
+def found_outliers(
+    model: CalibratedKinematics, data: Measurements, bad: Tensor, distances: Tensor, weights: Tensor | None = None
+) -> list[Outlier]:
+    """Wrong measurements with their probable causes, the worst first.
+
+    Args:
+        model: the calibrated model. data: the measurements. bad: (N, bodies) which of them are wrong.
+        distances: (N, bodies) from their predictions, m. weights: (N, bodies) in the fit, if they took part in it.
+    """
+    if not bool(bad.any()):
+        return []
+    labels = data.bodies.labels(data, model.on)
+    data = data if labels[0][1] is None else data.with_tips([str(tip) for _, tip in labels])
+    predicted, outlying, names = model.at_payloads(data.payload)(data.q).detach(), list[Outlier](), data.row_names
+    for row, body in bad.nonzero().tolist():
+        (marker, tip), weight = labels[body], None if weights is None else float(weights[row, body])
+        reason, line = _reason(row, body, data, predicted, bad), int(data.line_numbers[row])
+        outlying.append(Outlier(row, marker, line, names[row], float(distances[row, body]), weight, reason, tip))
+    return sorted(outlying, key=lambda outlier: -outlier.distance)
+
+
+def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
+    """Probable cause of an outlier, in words."""
+    small = gates.REMAINING_ERROR * float(known((predicted[row] - data.points[row]).norm(dim=-1)).max())
+    for other in data.bodies.exchangeable(data) if data.seen_bodies.shape[1] <= MAX_MARKERS_FOR_EXCHANGE else ():
+        errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
+        if other != body and float(errors.max()) < small:
+            return f"markers {body} and {other} seem to be exchanged"
+    others = [k for k in range(bad.shape[1]) if k != body and bool(data.seen_bodies[row, k])]
+    if others and not bool(bad[row, others].any()):
+        return f"{data.body_names[body]} alone is off, the other {data.bodies.many} of this row fit"
+    elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
+    elsewhere[row] = torch.inf
+    nearest = int(elsewhere.argmin())
+    if float(elsewhere[nearest]) < small:
+        return f"fits the configuration of row {int(data.line_numbers[nearest])}: a wrong pairing?"
+    return FAR
+
+
+# --- devices and columns ----------------------------------------------------------------------------------------------
+
+
+def _device_rows(data: Any) -> Iterator[tuple[str, Tensor, Any]]:
+    """The rows of any table by kind and device, in words, their numbers (M,), and they; those in sockets together."""
+    for part, numbers in zip(data.parts, data.index, strict=True):
+        names = [name * (place < 0) for name, place in zip(part.device_names, part.places.tolist(), strict=True)]
+        for name in dict.fromkeys(names):
+            rows = [row for row, other in enumerate(names) if other == name]
+            yield f"{part.kind}s" + f" of '{name}'" * bool(name), numbers[rows], part.rows(rows)
+
+
+def stuck_columns(data: Any) -> Iterator[tuple[str, Tensor]]:
+    """Columns of any table in which a device reports one value in all rows where it reports any, and these rows."""
+    for words, rows, table in _device_rows(data):
+        for name, values in table.measured().items():
+            if isinstance(values, Tensor) and not name.startswith(OF_DEVIATIONS):
+                present = ~values.isnan()
+                if int(present.sum()) >= gates.STUCK_ROWS and bool((values[present] == values[present][0]).all()):
+                    yield f"'{name}' of the {words}", rows[present.to(rows.device)]
+
+
+def warn_of_stuck(data: TangentData, table: Any) -> None:
+    """Warn of columns of one value although the robot moves what they tell, by the geometric calibration."""
+    size, shape = spread(data.points.unflatten(1, (-1, 3))), (data.noise_model.bodies, -1)
+    for column, numbers in stuck_columns(table):
+        rows = numbers.to(data.values.device)
+        values, visible = data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape)  # (M, P, r) m
+        bodies = [values[:, body, flags] for body, flags in enumerate(visible.all(0)) if bool(flags.any())]
+        spreads = [float(torch.linalg.svdvals(body - body.mean(0))[-1]) for body in bodies]
+        least = min(spreads, default=0.0) / len(rows) ** 0.5  # RMS motion along any direction, m
+        if least > gates.GEOMETRIC_RESIDUAL * size:
+            expected = f"values that change by {1e3 * least:.3g} mm or more, as the robot moves"
+            what, fix = f"{column} holds one value in all of its rows", "check the sensor and the column, or leave "
+            warn_user(sentence(what, expected=expected, fix=fix + "these rows out"))
+
+
+def warn_of_outliers(outlying: Sequence[Outlier], data: Any) -> None:
+    """Warn if so many rows of a table, or of one device, are outliers that the inliers may be the wrong ones."""
+    flags, parts = flagged(len(data), outlying), [("rows", torch.arange(len(data), device=HOST))]
+    parts += [(words, rows) for words, rows, _ in _device_rows(data)]
+    many = [(words, rows) for words, rows in parts if float(flags[rows].double().mean()) > gates.GROSS_SHARE]
+    if many:
+        counts = few([f"{int(flags[rows].sum())} of {len(rows)} {words}" for words, rows in many], MOST_NAMES)
+        fix = "do not rely on these rows: check that they pair joints with their own points, that markers keep their "
+        fix += "numbers, the columns and units; of a set-up, whether more has moved than was said: leave it out, and "
+        fix += "recalibrate the model with its rows alone, which finds both device and markers"
+        expected, got = f"at most {100 * gates.GROSS_SHARE:.0f} %", f"for the worst row: {outlying[0].reason}"
+        warn_user(sentence(f"{counts} are outliers", expected=expected, got=got, fix=fix))
+
+
+def flagged(count: int, outlying: Sequence[Outlier]) -> Tensor:
+    """(N,) boolean, true in the rows of outliers."""
+    flags = torch.zeros(count, dtype=torch.bool, device=HOST)
+    flags[[outlier.row for outlier in outlying]] = True
+    return flags
+
+
+# --- errors of rows that took no part in a fit ------------------------------------------------------------------------
 
 
 @outside_inference_mode
@@ -76,15 +298,19 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     return replace(errors.main, placed=errors.placed, numbers=errors.numbers) if len(errors) == 1 else errors
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """What errors of a model mean."""
+class Judgement(NamedTuple):
+    """What errors of a model mean: why they say nothing about the robot, or likely causes of large ones.
 
-    refusal: str | None = None  # why they say nothing about the robot; None if they do
-    causes: Sequence[str] = ()  # likely causes of large errors
-    moved: bool = False  # whether something that moved explains errors that say nothing
-    outliers: Sequence[Outlier] = ()  # positions that look wrong
-    rows: int = 0  # evenly chosen ones among which these were sought
+    Args:
+        moved: whether something that moved explains errors that say nothing. outliers: positions that look wrong.
+        rows: how many, evenly chosen, among which these were sought.
+    """
+
+    refusal: str | None = None
+    causes: Sequence[str] = ()
+    moved: bool = False
+    outliers: Sequence[Outlier] = ()
+    rows: int = 0
 
 
 def judge(
@@ -115,7 +341,7 @@ def judge(
     if some is None or errors is None or not (usual or errors.median > impossible):
         return Judgement()
     fix = "register the model first: `model.registered`, evaluate --free both"
-    moved = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
+    moved = [sentence(motion, fix=fix) for motion in motions(model, some)]
     causes = moved or [*filter(None, [implausible(model, some, errors)])]
     if errors.median > impossible:
         if usual and not moved:
@@ -124,7 +350,7 @@ def judge(
     if causes or not usual:
         return Judgement(None, causes)
     wrong = contradicted(model, some)
-    causes = [*filter(None, [block_text(model, some, wrong)])]
+    causes = [*filter(None, [block_text(model, some, flagged(len(some), wrong))])]
     claimed = expected_rms(model, some, errors.errors.shape[1])
     if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * claimed:
         what = f"the errors are {errors.rms / claimed:.1f} times as large as the model expects: "
@@ -145,33 +371,27 @@ def check_errors(model: CalibratedKinematics, evaluation: Evaluation, usual: flo
     limit = min(max(gates.LARGE_PER_REACH * reach, gates.LARGE_PER_USUAL * usual), gates.LARGEST_PER_REACH * reach)
     share = float((known(evaluation.errors) > limit).double().mean())
     if share > gates.MOST_LARGE:
-        raise MeasurementError.of(
-            f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
-            expected="errors of a calibrated robot",
-            got=f"an RMS error of {1e3 * evaluation.rms:.4g} mm",
-            fix="did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
-            "holds for a part of the rows at most",
-        )
+        what = f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model"
+        fix = "did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
+        got, fix = f"an RMS error of {1e3 * evaluation.rms:.4g} mm", fix + "holds for a part of the rows at most"
+        raise MeasurementError.of(what, expected="errors of a calibrated robot", got=got, fix=fix)
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
     """A sentence about errors that no calibrated robot has: expected and found median, what to check; else None."""
-    predicted, options = _expected(model, data), sensor_of(data).options
-    largest = model.robot.reach * gates.LARGEST_PER_REACH
-    medians = [(errors.median, float(predicted.claimed.median()), 1e3, "mm", largest)]
+    predicted, most = _expected(model, data), model.robot.reach * gates.LARGEST_PER_REACH
+    medians = [(errors.median, float(predicted.claimed.median()), 1e3, "mm", most)]
     if errors.orientation is not None:
         turns = predicted.covariance[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         medians.append((radians(errors.orientation.median), float(turns.median()), degrees(1.0), "degrees", inf))
-    for median, usual, per_unit, unit, most in medians:
-        if median > min(most, gates.LARGEST_PER_EXPECTED * usual):
-            return sentence(
-                "these errors are not those of a calibrated robot",
-                expected=f"a median of about {per_unit * usual:.2g} {unit} by the model's own uncertainty",
-                got=f"{per_unit * median:.3g} {unit}",
-                fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
-                "device nor the markers have moved: a model predicts in the measuring frame of its fit (if they "
-                "have, register the model: `model.registered`, evaluate --free both; or recalibrate it)",
-            )
+    for median, usual, per_unit, unit, largest in medians:
+        if median > min(largest, gates.LARGEST_PER_EXPECTED * usual):
+            expected = f"a median of about {per_unit * usual:.2g} {unit} by the model's own uncertainty"
+            fix = f"check `length` and `angle`, the order of the columns{sensor_of(data).options}, and that neither "
+            fix += "device nor markers have moved: a model predicts in the measuring frame of its fit (if they have, "
+            fix += "register the model: `model.registered`, evaluate --free both; or recalibrate it)"
+            what, got = "these errors are not those of a calibrated robot", f"{per_unit * median:.3g} {unit}"
+            return sentence(what, expected=expected, got=got, fix=fix)
     return None
 
 
@@ -187,11 +407,7 @@ def _expected(model: CalibratedKinematics, data: Measurements) -> Predicted:
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:
-    """RMS distance, m, between new measurements and predictions that a model expects of the poses of some rows.
-
-    Args:
-        model: a calibrated model. data: its markers. bodies: how many of them, or of its frames, a device measured.
-    """
+    """RMS distance, m, that a model expects at some rows, of the first markers or frames, which a device measured."""
     return float(_expected(model, data).claimed[:, :bodies].square().mean().sqrt())
 
 
@@ -205,77 +421,57 @@ def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
     return out_of_step(predicted, data.points, data.line_numbers, typical)
 
 
-def block_text(model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier]) -> str | None:
-    """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
+def find_block(wrong: Tensor) -> tuple[int, int] | None:
+    """First and last + 1 of the rows (N,), in order, where wrong ones follow one another beyond chance; or None.
+
+    The segment with the largest likelihood ratio of ``gates.BLOCK_SHARE`` against the overall share (S. Karlin,
+    S. Altschul, "Methods for assessing the statistical significance of molecular sequence features", 1990).
+    """
+    count, n = int(wrong.sum()), len(wrong)
+    share = count / n
+    if count < gates.BLOCK_ROWS or share >= gates.BLOCK_SHARE:
+        return None
+    gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
+    total, start, end = best_run(torch.where(wrong, gain, loss))
+    return (start, end) if total > log(n / gates.BLOCK_CHANCE) else None
+
+
+def block_text(model: CalibratedKinematics, data: Measurements, wrong: Tensor) -> str | None:
+    """One sentence about rows, wrong by flags (N,), that follow one another, with their common cause; else None."""
     order = data.line_numbers.argsort()
-    flags = flagged(len(data), [outlier.row for outlier in wrong])[order]
-    span = find_block(flags)
-    if span is None:
+    if (span := find_block(flags := wrong[order])) is None:
         return None
     start, end = span
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
     size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
-    why = ", ".join(cause.sentence for cause in motions(model, block))
-    return sentence(
-        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}",
-        got=f"a median error of {1e3 * size:.3g} mm{f'; {why}' if why else ', for no common reason'}",
-        fix="check what happened there; calibrate without these lines, or measure them again",
+    what = (
+        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}"
     )
+    got = f"a median error of {1e3 * size:.3g} mm; {', '.join(motions(model, block)) or 'for no common reason'}"
+    fix = "check what happened there; calibrate without these lines, or measure them again"
+    return sentence(what, got=got, fix=fix)
 
 
 def common_cause(
-    model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier], moved: str | None = None
+    model: CalibratedKinematics, data: Measurements, wrong: Tensor, moved: str | None = None
 ) -> str | None:
-    """The best explanation of several wrong rows: they are out of step, something moved, they follow one another.
-
-    Args:
-        moved: a sentence about something that moved, which explains wrong rows after it.
-    """
-    steps = steps_of(model, data) if len(wrong) >= gates.LAG_ROWS else []
+    """The best explanation of wrong rows, flags (N,): out of step, ``moved`` by what a sentence says, or a block."""
+    steps = steps_of(model, data) if int(wrong.sum()) >= gates.LAG_ROWS else []
     return steps[0].sentence() if steps else moved or block_text(model, data, wrong)
 
 
-def warn_of_contradictions(
-    model: CalibratedKinematics, coordinates: Coordinates | None, wrong: Sequence[Outlier], moved: str | None
-) -> None:
-    """Warn of the best explanation of wrong rows of a fit, see :func:`common_cause`.
+def motions(model: CalibratedKinematics, data: Measurements) -> list[str]:
+    """The motions of device or markers that explain most of a model's errors on rows, in words, the best first.
 
-    Args:
-        model: the fitted model. coordinates: its rows that tell coordinates. wrong: the outliers among all rows.
+    Such as ``moving the measuring device by 12.3 mm and 0.4 degrees explains 95 % of the squared error``.
     """
-    if coordinates is not None:
-        numbers = {row: number for number, row in enumerate(coordinates.rows.tolist())}
-        wrong = [replace(outlier, row=numbers[outlier.row]) for outlier in wrong if outlier.row in numbers]
-        moved = common_cause(model, coordinates.table, wrong, moved)
-    if moved is not None:
-        warn_user(moved)
-
-
-# --- a moved device or a moved marker: the best motion, and how much of the errors it explains ------------------------
-
-
-class Motion(NamedTuple):
-    """A motion that explains a part of the squared error, and errors (N, P, 3) that remain, m, NaN where hidden."""
-
-    what: str  # "the measuring device" or "the marker"
-    size: str
-    left: Tensor
-    explained: float
-
-    @property
-    def sentence(self) -> str:
-        """Such as ``moving the measuring device by 12.3 mm and 0.4 degrees explains 95 % of the squared error``."""
-        return f"moving {self.what} by {self.size} explains {100 * self.explained:.4g} % of the squared error"
-
-
-def motions(model: CalibratedKinematics, data: Measurements) -> list[Motion]:
-    """The motions that explain most of a model's errors on rows of its markers, the best first; or none."""
     data, some = _some(data, MOST_ROWS), _some(data, MOST_EXPECTED)
-    laden = model.at_payloads(data.payload)
-    errors = data.points - laden(data.q).detach()
+    laden, eye = model.at_payloads(data.payload), torch.eye(3, dtype=data.q.dtype, device=data.q.device)
+    predicted = laden(data.q).detach()
+    errors = data.points - predicted
     covariance = model.at_payloads(some.payload).map.posterior(some.q)[1]
-    usual, count = float(covariance.diagonal(dim1=1, dim2=2).mean(1).median()), int((~errors.isnan()).sum())
+    usual, visible = float(covariance.diagonal(dim1=1, dim2=2).mean(1).median()), ~errors.flatten(1).isnan()
 
     def size(errors: Tensor) -> float:
         """Median of the mean squares of the rows' known coordinates."""
@@ -283,30 +479,22 @@ def motions(model: CalibratedKinematics, data: Measurements) -> list[Motion]:
 
     if size(errors) < gates.LEAST_EXCESS**2 * usual:
         return []
-    likely = list[Motion]()
-    for what, by, left, unknowns in (_of_device(data.points, errors), _of_markers(laden, data.q, errors)):
-        freedom = count - unknowns
-        share = float(left.square().nansum() / errors.square().nansum()) * count / freedom if freedom > 0 else 1.0
-        if size(left) < gates.MOST_LEFT**2 * usual:
-            likely.append(Motion(what, by, left, 1.0 - share))
-    least = max([gates.LEAST_EXPLAINED, *(each.explained - gates.AS_GOOD for each in likely)])
-    return sorted((each for each in likely if each.explained >= least), key=lambda motion: -motion.explained)
-
-
-def _of_device(measured: Tensor, errors: Tensor) -> tuple[str, str, Tensor, int]:
-    """What moves, by how much, the errors that remain, and the count of unknowns."""
-    predicted = measured - errors
-    T = rigid_fit(predicted.flatten(0, 1), measured.flatten(0, 1))
-    turn = float(angle_between(torch.eye(3, dtype=T.dtype, device=T.device), T[:3, :3]))
-    by = f"{1e3 * float(errors.nanmean((0, 1)).norm()):.3g} mm" + f" and {degrees(turn):.2g} degrees" * bool(turn)
-    return "the measuring device", by, measured - predicted @ T[:3, :3].mT - T[:3, 3], 6
-
-
-def _of_markers(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> tuple[str, str, Tensor, int]:
-    points = FlangePoints(model.nominal, model.geometry.tool, same=True)
-    geodesic, away, visible = model.map.geodesic.with_nominal(points), errors.flatten(1), ~errors.flatten(1).isnan()
-    slopes = marker_slopes(geodesic, points, geodesic.linearise(q))  # (N, m, m)
-    step = torch.linalg.lstsq(slopes[visible], away[visible][:, None], driver="gelsd").solution[:, 0]
-    shift = step.view(-1, 3).norm(dim=1)
-    what = f"{model.bodies.moved_words(len(shift))} on the flange"
-    return what, f"{1e3 * float(shift.max()):.3g} mm", (away - slopes @ step).view_as(errors), len(step)
+    T = rigid_fit(predicted.flatten(0, 1), data.points.flatten(0, 1))
+    turn = degrees(float(angle_between(eye, T[:3, :3])))
+    by = f"{1e3 * float(errors.nanmean((0, 1)).norm()):.3g} mm" + f" and {turn:.2g} degrees" * bool(turn)
+    left = {f"the measuring device by {by}": (data.points - predicted @ T[:3, :3].mT - T[:3, 3], 6)}
+    points = FlangePoints(laden.nominal, laden.geometry.tool, same=True)
+    geodesic = laden.map.geodesic.with_nominal(points)
+    slopes = marker_slopes(geodesic, points, geodesic.linearise(data.q))  # (N, m, m)
+    target = errors.flatten(1)[visible][:, None]
+    step = torch.linalg.lstsq(slopes[visible], target, driver="gelsd").solution[:, 0]
+    shifts = step.view(-1, 3).norm(dim=1)
+    words = f"{laden.bodies.moved_words(len(shifts))} on the flange by {1e3 * float(shifts.max()):.3g} mm"
+    left[words] = errors - (slopes @ step).view_as(errors), len(step)
+    explained, count = dict[str, float](), int(visible.sum())
+    for words, (after, unknowns) in left.items():
+        part = float(after.square().nansum() / errors.square().nansum()) * count / max(count - unknowns, 1e-9)
+        if size(after) < gates.MOST_LEFT**2 * usual:
+            explained[f"moving {words} explains {100 * (1 - part):.4g} % of the squared error"] = 1.0 - part
+    least = max([gates.LEAST_EXPLAINED, *(part - gates.AS_GOOD for part in explained.values())])
+    return sorted((text for text, part in explained.items() if part >= least), key=lambda text: -explained[text])

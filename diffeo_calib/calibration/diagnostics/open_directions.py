@@ -6,7 +6,6 @@ The calibration goes on, and its predictions carry the deviations that follow. T
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf
 from typing import Any
 
 import torch
@@ -17,18 +16,13 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.registered_map import undetermined
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 
 TILT = "tilt the tool by 20 degrees or more, to several sides"
-STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
-"""Of the search for joint values that bring the ball to a place."""
 
 
 def warn_of_open_directions(robot: Tree, data: Measurements, registration: Identification) -> None:
@@ -132,59 +126,3 @@ def without_shared(effects: Tensor, shared: Tensor) -> Tensor:
         return effects
     shared = shared / shared.norm(dim=0).clamp(min=1e-12)
     return effects - shared @ torch.linalg.lstsq(shared, effects, rcond=1e-6, driver="gelsd").solution
-
-
-def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:
-    """Warn of sockets near a plane if one place away from it would make the expected error smaller.
-
-    All sockets on one table need not leave anything open: a tool that tilts shows errors of all joints, and the rows
-    reach as many joint values as with a raised block. So the place is raised in the model.
-
-    Args:
-        fitted: the map, without rigid motions. positions: (S, 3) of the sockets, m.
-        socket: (N,) number of the socket of each row of the map, -1 for none. place: (S,) the place of each socket.
-        now: the expected error, m.
-    """
-    _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
-    reach = float(positions.norm(dim=1).max())
-    if len(s) < 3 or float(s[2]) > gates.FLAT * reach * len(positions) ** 0.5:
-        return
-    rows = (socket >= 0).nonzero()[:, 0]
-    rows = rows[place[socket[rows]] == place[socket[rows]].mode().values]
-    raised = gates.RAISED * reach * axes[2]
-    goals = (positions[socket[rows]] + sign * raised for sign in (1.0, -1.0))
-    least = min(_error_with_place(fitted, fitted.x[rows], goal, socket[rows]) for goal in goals)
-    if least < gates.WORTHWHILE_PLACE * now:
-        expected = (
-            f"about {1e3 * least:.2g} mm of error with one place {1e3 * gates.RAISED * reach:.0f} mm away from it"
-        )
-        fix = "raise or tilt the block at one place, and tilt the tool"
-        warn_user(sentence("the sockets lie near a plane", expected=expected, got=f"{1e3 * now:.2g} mm", fix=fix))
-
-
-def _error_with_place(fitted: FittedMap, q: Tensor, goal: Tensor, socket: Tensor) -> float:
-    """RMS error, m, of the ball that the model expects over its workspace with rows at one more place.
-
-    Args:
-        q: (M, n) near which joint values bring the ball to points ``goal`` (M, 3) m, in sockets of these numbers (M,).
-
-    Returns:
-        infinite if the robot reaches less than half of them.
-    """
-    for _ in range(STEPS):
-        miss = goal - fitted(q).detach()[:, -3:]
-        step = (torch.linalg.pinv(fitted.jacobian(q).detach()[:, -3:]) @ miss[..., None])[..., 0]
-        q = q + step * (LARGEST_STEP_RAD / step.abs().amax(1, keepdim=True).clamp(min=LARGEST_STEP_RAD))
-    there = (goal - fitted(q).detach()[:, -3:]).norm(dim=1) < REACHED_M
-    if int(there.sum()) < len(there) / 2:
-        return inf
-    socket = socket[there]
-    at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
-    conditional, m = fitted.conditional, fitted.m
-    within, between = conditional.covariance_between(new), conditional.covariance_between(at, new)
-    same = (socket[:, None] == socket).to(within) * PLACES.found_m_rad**2
-    noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
-    K = within + noise + torch.kron(same, torch.eye(m, dtype=within.dtype, device=within.device))
-    gain = between @ torch.linalg.solve(K, between.mT)
-    after = conditional.covariance(at) - diagonal_blocks(gain, len(fitted.everywhere))
-    return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())

@@ -18,15 +18,14 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import variation
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_identification,
     check_readings,
     check_socket_registration,
     registered,
-    warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.identification.identification import (
@@ -338,8 +337,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     registration = registered(robot, table)
     for resting in resting_rows(tables):
         own = register_sockets(registration.geometry, resting.q, resting.device)
-        check_socket_registration(robot, resting, own, registration.geometry)
-        warn_of_other_robot(robot, table, registration, own)
+        check_socket_registration(robot, resting, own, (registration.geometry, table))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     geometry, ball = registration.geometry, None

@@ -21,10 +21,9 @@ from torch.nn.functional import one_hot, pad
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, excluded
+from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, excluded
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
-from diffeo_calib.calibration.expected_errors import ExpectedError, workspace_deviation
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,
     Prior,
@@ -41,9 +40,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import own_blocks
-from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.readings import KIND, SEPARATOR, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings, Sockets
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -143,9 +141,9 @@ class SocketDevices(ReadingDevices):
     left_out_spread: float = nan
 
     @property
-    def sockets(self) -> Sockets:
+    def sockets(self) -> SocketReadings:
         """Their names and known distances."""
-        return with_attributes(self.data, names=self.names).sockets
+        return with_attributes(self.data, names=self.names)
 
     @property
     def positions(self) -> Tensor:
@@ -207,10 +205,7 @@ class SocketDevices(ReadingDevices):
         return self.positions[self.device] - numbers.in_table(errors)[self.rows, :3]
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
-        """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
-        place, socket = self.sockets.place, self.by_row(len(model.configurations))
-        if model.map.workspace is not None:
-            warn_of_flat_places(model.map, self.positions, socket, place, workspace_deviation(model.map))
+        """Nothing: sockets without a known distance are warned of at the start."""
 
     def entry(self) -> dict[str, object]:
         """Positions by name, and spread of places left out, for programs; in m."""

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.row_order import find_block
+from diffeo_calib.calibration.diagnostics.judged_rows import find_block
 from diffeo_calib.calibration.recalibration.drift import (
     NEGLIGIBLE_EIGENVALUE_SHARE,
     OFFSET_DEVIATION_RAD_M,

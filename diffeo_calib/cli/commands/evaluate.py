@@ -13,8 +13,7 @@ import torch
 import typer
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.judged_rows import evaluate, expected_rms, judge
-from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
+from diffeo_calib.calibration.diagnostics.judged_rows import evaluate, expected_rms, judge, outlier_lines
 from diffeo_calib.calibration.expected_errors import accuracy
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say

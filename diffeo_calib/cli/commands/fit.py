@@ -11,8 +11,7 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.judged_rows import check_errors
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, outlier_lines
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, check_errors, contradicted, outlier_lines
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC

@@ -32,8 +32,7 @@ _DEGREES = re.compile(
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _TYPOGRAPHY = str.maketrans("\u2212\u2013\u2019\u00a0\u202f\u2009", "--'   ")
 
-LARGEST_NUMBER = 1e12
-"""Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
+LARGEST_NUMBER = 1e12  # larger numbers, in any unit, are no measurements: marks of missing readings, or damage
 _PLAIN = re.compile(r"[0-9+\-.eE]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
 
@@ -110,8 +109,7 @@ def numbers_in(texts: Sequence[str], decimal: str, *, whole: bool = True) -> lis
     return values
 
 
-_GROUP = {".": ",", ",": "."}
-"""By decimal mark, the one between thousands that may be a decimal mark too."""
+_GROUP = {".": ",", ",": "."}  # by decimal mark, the one between thousands that may be a decimal mark too
 
 
 def number(text: str, decimal: str, *, grouped: bool = False) -> float | None:

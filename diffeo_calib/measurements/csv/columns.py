@@ -20,12 +20,12 @@ from diffeo_calib.measurements.table_format import (
     TableFormat,
     check_choice,
     column_names,
-    flat_names,
 )
 from diffeo_calib.robots.joint import KINDS
 
-PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}
-"""Units per rad or m; numbers without a unit are as they are."""
+PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}  # units per rad or m; numbers without a unit are as they are
+POSITIONS, ROTATIONS, STD, ROTATION_STD = "positions", "rotations", "std", "rotation_std"
+"""Roles of the columns of a marker or frame."""
 
 
 class Check(NamedTuple):
@@ -46,7 +46,7 @@ class Column(NamedTuple):
     name: str
     unit: str | float | None = None  # in the file: m, mm, rad, deg, or how many of it are one in SI; None without
     check: Check | None = None  # what the numbers are expected to be
-    what: str = ""  # name of numbers whose unit is judged by their size
+    role: str = ""  # what they say of a marker or frame
 
     @property
     def per_si(self) -> float:
@@ -67,6 +67,10 @@ class Body(NamedTuple):
     def values(self) -> list[Column]:
         """Those that hold no deviations; deviations where there are no others."""
         return [column for column in self.columns if column.check != DEVIATION] or [*self.columns]
+
+    def of(self, role: str) -> list[Column]:
+        """Those that have a role."""
+        return [column for column in self.columns if column.role == role]
 
 
 @dataclass(frozen=True)
@@ -92,24 +96,19 @@ class Columns:
         if table.joint_length is not None and not kinds_known:
             what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
-        for name, column in table.beside.items():
-            column_names(name, [column], "the name of a column", (1,))
-        given, others = table.joints, list[Column]()
+        numbers = list[Column]()
         for sensor in sensors:
             new = [column for body in sensor.bodies(table) for column in body.columns]
-            others += [one for one in new if one not in others or one.check != DEVIATION]  # kinds may share deviations
+            numbers += [column for column in new if column not in numbers or column.check != DEVIATION]  # may be shared
+        for name, column in table.beside.items():
+            column_names(name, [column], "the name of a column", (1,))
+            numbers.append(Column(column.strip(), check=MASS if name == "payload" else None))
+        given = table.joints
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
-        checks = {"payload": MASS}
-        beside = (Column(column.strip(), check=checks.get(name)) for name, column in table.beside.items())
-        columns = cls(table, read, prismatic, kinds_known, (*others, *beside), sensors)
+        columns = cls(table, read, prismatic, kinds_known, tuple(numbers), sensors)
         if twice := repeated(columns.names) or repeated(names):
-            markers = len(table.triples)
-            what = "`joints`" + " and `position`" * bool(markers)
-            what = what if len(columns.names) == len(names) + 3 * markers else "the named columns"
-            fix = "name every column once"
-            deviations = {*twice} & {*flat_names(table.std), *flat_names(table.rotation_std)}
-            fix += ", and one that holds the deviations of all axes alone" * bool(deviations)
-            raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
+            got, fix = f"{listed(twice)} twice", "name every column once, one of the deviations of all axes too"
+            raise MeasurementError.of("the named columns", expected="distinct columns", got=got, fix=fix)
         return columns
 
     @property
@@ -120,8 +119,8 @@ class Columns:
     @property
     def texts(self) -> dict[str, bool]:
         """The columns of texts, and whether a table must have them."""
-        pairs = [pair for sensor in self.sensors for pair in sensor.texts.items()]
-        return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
+        pairs = sorted((pair for sensor in self.sensors for pair in sensor.texts.items()), key=lambda pair: pair[1])
+        return dict(pairs)
 
     @property
     def all_hidden(self) -> bool:
@@ -132,8 +131,12 @@ class Columns:
     def hideable(self) -> list[Body]:
         """The columns of every body that lines may leave empty, markers and frames first."""
         some = [body for kind in self.sensors if self.all_hidden or kind.hidden for body in kind.bodies(self.table)]
-        read = ([column for column in body.columns if column in self.numbers] for body in some)
-        return [Body(columns, body.word) for body, columns in zip(some, read, strict=True) if columns and body.word]
+        read = (body._replace(columns=self.read(body.columns)) for body in some)
+        return [body for body in read if body.columns and body.word]
+
+    def read(self, some: Sequence[Column]) -> list[Column]:
+        """Those that the file has: a coordinate may be 0 in all rows."""
+        return [column for column in some if column in self.numbers]
 
     def places(self, some: Sequence[Column]) -> list[int]:
         """Their places among all columns."""
@@ -142,9 +145,8 @@ class Columns:
     def cells(self, q: Tensor, numbers: Mapping[str, Tensor]) -> dict[str, list[float]]:
         """The cells of columns by name, of joint values (N, n) and of numbers (N,) by their columns, in SI."""
         joints = zip(self.joints.columns, self.joints_from_si(q).T.tolist(), strict=True)
-        cells = {
-            one.name: (numbers[one.name].cpu() * one.per_si).tolist() for one in self.numbers if one.name in numbers
-        }
+        there = (column for column in self.numbers if column.name in numbers)
+        cells = {column.name: (numbers[column.name].cpu() * column.per_si).tolist() for column in there}
         return dict(joints) | cells
 
     def joints_from_si(self, q: Tensor) -> Tensor:
@@ -159,14 +161,15 @@ class Columns:
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
-        count, table, plain = len(self.joints.columns), self.table, self.joints.plain
-        q = self.joints.values(raw[:, :count])[:, plain] if bool(plain.any()) else raw[:, :0]
+        table, plain = self.table, self.joints.plain
+        q = self.joints.values(raw[:, : len(self.joints.columns)])[:, plain] if bool(plain.any()) else raw[:, :0]
         slide, given = self.prismatic[plain], self.kinds_known
         sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=given)
         sentences += unlikely_units("prismatic joints", q[:, slide], table.joint_unit, "joint_length")
-        for what, option in (("positions", "length"), ("rotations", "rotation_angle")):
-            alike = [column for column in self.numbers if column.what == what]
-            sentences += unlikely_units(what, raw[:, self.places(alike)], str(alike[0].unit), option) if alike else []
+        for role, option in ((POSITIONS, "length"), (ROTATIONS, "rotation_angle")):
+            alike = [column for column in self.numbers if column.role == role]
+            alike = [column for column in alike if column.unit == alike[0].unit]  # no angles of places
+            sentences += unlikely_units(role, raw[:, self.places(alike)], str(alike[0].unit), option) if alike else []
         return sentences
 
 
@@ -183,21 +186,15 @@ def _joint_columns(joints: Any, kinds: Sequence[str] | None) -> tuple[tuple[str,
         joints, kinds = joints.texts, kinds if joints.robot is None else joints.robot.kinds
     kinds = getattr(joints, "kinds", None) if kinds is None else kinds
     joints = getattr(joints, "joint_names", joints)  # a robot
-    if (
-        not isinstance(joints, Collection)
-        or isinstance(joints, str)
-        or len(joints) == 0
-        or not all(isinstance(name, str) for name in joints)
-    ):
+    texts = isinstance(joints, Collection) and not isinstance(joints, str)
+    if not texts or len(joints) == 0 or not all(isinstance(name, str) for name in joints):
         expected, fix = "names of columns, or a robot", "pass a list such as ['q1', 'q2'], in the robot's order"
         raise MeasurementError.of("`joints`", expected=expected, got=as_written(joints), fix=fix)
-    given = kinds is not None
-    kinds = list(kinds) if given else ["revolute"] * len(joints)
-    if len(kinds) != len(joints):
-        expected = f"{len(kinds)} columns of joints, one for each of `kinds`"
-        fix = "name a column for every joint of the robot, in its order"
-        raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
-    for kind in kinds:
+    of_each = ["revolute"] * len(joints) if kinds is None else list(kinds)
+    if len(of_each) != len(joints):
+        expected = f"{len(of_each)} columns, one for each of `kinds`, in the robot's order"
+        raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})")
+    for kind in of_each:
         check_choice("kinds", kind, [allowed for allowed in KINDS if allowed != "fixed"])
-    prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
-    return tuple(name.strip() for name in joints), prismatic, given
+    prismatic = torch.tensor([kind == "prismatic" for kind in of_each], dtype=torch.bool, device=HOST)
+    return tuple(name.strip() for name in joints), prismatic, kinds is not None

@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import MeasurementError, few, listed, shown, war
 from diffeo_calib.common.files import as_path
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import Columns, check_count
+from diffeo_calib.measurements.csv.columns import POSITIONS, ROTATION_STD, ROTATIONS, STD, Columns, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
@@ -95,10 +95,8 @@ def _divided(rows: FileRows) -> list[tuple[SensorColumns, FileRows]]:
         raise MeasurementError.of(what, expected="some rows of this kind", fix="leave its columns out")
     empty = [rows.lines[row] for row in (~torch.stack(filled).any(0)).nonzero()[:, 0].tolist()]
     if empty:
-        what, words = f"file '{rows.path}', line {few(empty)}", [sensor.word for sensor in sensors]
-        fix, got = "fill in one of them, or remove the line", "neither" if len(words) == 2 else "none of them"
-        expected = " or ".join([", ".join(words[:-1]), words[-1]])
-        raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+        what, expected = f"file '{rows.path}', line {few(empty)}", " or ".join(sensor.word for sensor in sensors)
+        raise MeasurementError.of(what, expected=expected, got="empty cells", fix="fill them in, or remove the line")
     return [(sensor, rows.of(here)) for sensor, here in zip(sensors, filled, strict=True)]
 
 
@@ -182,11 +180,7 @@ def read_measurements(
 
 
 def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
-    """Joint configurations (N, n), rad (revolute) and m (prismatic), from a CSV file, rows in the order of the file.
-
-    Errors and warnings are those of :func:`read_measurements`. Of the format only units, separator, decimal mark and
-    joints matter.
-    """
+    """Joint configurations (N, n), rad (revolute) and m (prismatic), of a file, see :func:`read_measurements`."""
     return read_configurations(path, table)["q"]
 
 
@@ -232,11 +226,9 @@ def write_predictions(
     Args:
         path: the file; it appears when the last block is written.
         blocks: configurations (B, n), rad and m; markers (B, P, 3), m, or poses (B, 4, 4) or (B, T, 4, 4), m; standard
-            deviations (B, P, 3), m, or (B, 6) or (B, T, 6): of positions, m, and of rotations about the measuring
-            frame's axes, rad; and more cells (B, k) as they are written.
-        table: the format, of poses with defaults as in :func:`write_measurements`.
-        prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
-        poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
+            deviations (B, P, 3) or (B, T, 6), m, and rad about the measuring axes; more cells (B, k) as written.
+        table: the format, of poses with defaults as in :func:`write_measurements`; columns: further fields of it.
+        prefixes: of the columns of each marker or frame. more: k further columns. poses: whether these are predicted.
     """
     position = [[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes]
     table = replace(table, **columns, position=position, spherical=None)
@@ -244,7 +236,8 @@ def write_predictions(
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
     numeric = columns_of(table)
     sensor: PositionColumns = numeric.sensors[0]
-    of_bodies = [name for body in sensor.each for k in (0, 2, 1, 3) for name in body[k]]
+    order = POSITIONS, STD, ROTATIONS, ROTATION_STD
+    of_bodies = [column.name for body in sensor.each for role in order for column in body.of(role)]
     names = [*numeric.joints.columns, *of_bodies]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
@@ -258,21 +251,18 @@ def write_predictions(
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
 
-SOCKET, SESSION = "socket", "session"
-"""Names of columns that are written."""
+SOCKET, SESSION = "socket", "session"  # names of columns that are written
 
 
 @outside_inference_mode
 def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat, **columns: Any) -> TableFormat:
     """Write a CSV file that :func:`read_measurements` or :func:`read_observations` reads back; overwrites.
 
-    In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations, payloads, covariates and names of set-ups and devices are written if they are known.
-    Cells are empty for hidden markers, and where a row of another kind has no value. Every row is one line.
+    In rad and m the round trip of joints and points is exact; in other units to the last digits of float64. All that is
+    known is written. Cells are empty for hidden markers, and where a row of another kind has no value.
 
     Args:
-        path: the file.
-        data: measurements, readings or observations, rad, m and pixels.
+        path: the file. data: measurements, readings or observations, rad, m and pixels.
         table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
             the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
             ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
@@ -284,12 +274,10 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
 
     Returns:
         the format of the file. Sockets are in the column ``socket``, readings in distance, displacement, height, or u
-        and v, with a number after it for a second table of the same kind. Known distances between sockets are not in
-        the file, but in this format.
+        and v, with a number after it for a second table of the same kind. Known distances are in this format alone.
 
     Raises:
-        MeasurementError: unknown unit, a number of names that does not match, names for something that the table
-            does not hold, or both positions and poses.
+        MeasurementError: names that do not match, or of what the table does not hold; both positions and poses.
         InputError: a file that cannot be written.
     """
     whole, table = Observations.joined([data]), replace(table, **columns)
@@ -332,9 +320,8 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     names = {name for part in whole.parts if part.kind != "socket" for name in part.device_names} - {""}
     board = None if device is None else device.board
     if table.camera_on_tool != (board is not None):
-        got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
-        fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
-        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
+        fix = "pass as it is with the measurements, and read the table with the same format"
+        raise MeasurementError.of("`camera_on_tool`", expected=board is not None, got=table.camera_on_tool, fix=fix)
     if table.session is not None and not names:
         raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
     if device is not None and device.corners is not None:
@@ -369,11 +356,15 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
     columns, taken = list[Any](), list[str]()
     for part in whole.parts:
         if "corners" in part.columns:
-            columns.append(ImageColumns.of(part, session))
+            several, sizes = len(part.cameras) > 1, {name: (c.width, c.height) for name, c in part.cameras.items()}
+            set_ups = part.session_names and not (several and part.device_names == part.camera_names)
+            camera = sizes if several else sizes.popitem()[1]
+            columns.append(ImageColumns(camera, part.board is not None, session if set_ups else None))
         elif part.kind == "socket":
-            sockets = part.sockets  # a reader finds these alone
-            distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}
-            columns.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
+            distances = {
+                (part.names[a], part.names[b]): length for a, b, length in part.lengths
+            }  # a reader finds these
+            columns.append(SocketColumns((SOCKET,), distances or None, part.distance_std, part.ball_tip))
         elif part.kind in ("position", "pose"):
             columns.append(None)
         else:

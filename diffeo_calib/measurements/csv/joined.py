@@ -31,12 +31,10 @@ from diffeo_calib.measurements.csv.cells import csv_text, find_columns, number
 from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
-MOVED = 1e-3
-"""Part of the range of a column by which it moves at least, unless its noise is larger."""
+MOVED = 1e-3  # part of the range of a column by which it moves at least, unless its noise is larger
 CLOCKS_AGREE = 0.1
 """Spread of the differences of two clocks at most, relative to the pauses between rows, and to how these differ."""
-Pairs = list[tuple[int, int]]
-"""Numbers of lines with the same joint values: of the joints and of the places."""
+Pairs = list[tuple[int, int]]  # numbers of lines with the same joint values: of the joints and of the places
 
 
 class HeldFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
@@ -119,9 +117,8 @@ def joined_file(
         if (rows := sorted({*range(len(file.keys))} - {pair[k] for pair in pairs}))
     ]
     if not pairs:
-        fix = "name a column with the same texts in both files, or with times of one clock"
-        expected, got = "values that both files have", " and ".join(without)
-        raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
+        fix, got = "name a column with the same texts in both files, or with times of one clock", " and ".join(without)
+        raise MeasurementError.of(f"--by {shown(by)}", expected="values that both files have", got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
     joined = HeldFile(places)
     joined.content = _written(tables, pairs, sep)
@@ -169,12 +166,10 @@ def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) ->
         if count > 1:
             table, other = tables[k], tables[1 - k]
             lines = [other.sheet.rows[pair[1 - k]][0] for pair in pairs if pair[k] == row]
-            fix = "remove the lines that do not belong there"
-            fix += "; if they are of several markers, name the column of these (--marker)" * (k == 0)
+            fix = "remove those that do not belong there, or name the column of markers (--marker)"
             what = f"file '{table.path}', line {table.sheet.rows[row][0]}, {table.by} {shown(table.keys[row])}"
-            raise MeasurementError.of(
-                what, expected="one partner", got=f"lines {few(lines)} of '{other.path}'", fix=fix
-            )
+            got = f"lines {few(lines)} of '{other.path}'"
+            raise MeasurementError.of(what, expected="one partner", got=got, fix=fix)
 
 
 def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
@@ -196,16 +191,11 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
 # --- stops
 
 Array = np.ndarray
-PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-"""Columns of a place and a rotation."""
-NOISE_FACTOR = 8.0
-"""Range of the noise within a window, in standard deviations, that is no motion."""
-STEP_S = 0.01
-"""Of the grid on which both recordings are compared."""
-SAME_TURN = 1e-9
-"""Range of a quaternion's numbers at all stops that is rounding."""
-FEWEST_CHANGES = 4
-"""Beginnings and ends of motions that tell how far the clocks differ."""
+PLACE, TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")  # columns of a place and a rotation
+NOISE_FACTOR = 8.0  # range of the noise within a window, in standard deviations, that is no motion
+STEP_S = 0.01  # of the grid on which both recordings are compared
+SAME_TURN = 1e-9  # range of a quaternion's numbers at all stops that is rounding
+FEWEST_CHANGES = 4  # beginnings and ends of motions that tell how far the clocks differ
 
 
 @dataclass(frozen=True)
@@ -327,9 +317,11 @@ def pictured(
 def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
     """MeasurementError unless two recordings belong to the same time."""
     if times.max() + tolerance < joints.times[0] or times.min() - tolerance > joints.times[-1]:
-        expected = f"those of the joint states, {joints.times[0]:.3f} to {joints.times[-1]:.3f} s"
+        expected, fix = (
+            f"{joints.times[0]:.3f} to {joints.times[-1]:.3f} s, as of the joints",
+            "give the clocks' offset",
+        )
         got = f"{times.min():.3f} to {times.max():.3f} s"
-        fix = "let both use one clock, or give the offset"
         raise MeasurementError.of("the times of what was seen", expected=expected, got=got, fix=fix)
 
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
 from math import degrees, pi
 from pathlib import Path
 from runpy import run_path
@@ -27,8 +26,8 @@ from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_wr
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, ANGLE_UNITS, CONVENTIONS, MAKERS, numbers_of
+from diffeo_calib.measurements.poses import readings_of, rotation_matrices, rotation_numbers
+from diffeo_calib.measurements.table_format import CONVENTIONS, MAKERS, numbers_of
 from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain
@@ -74,10 +73,10 @@ class JointExpressions:
         """The inverse of :meth:`values`; MeasurementError where the joints do not tell every column."""
         n, c = self.matrix.shape
         if n != c or int(torch.linalg.matrix_rank(self.matrix)) < n:
-            what = f"the columns {listed(self.columns)} of joints {listed(self.texts)}, to be written"
-            got = f"{c} columns of {n} joints" if n != c else "joints that depend on each other"
-            fix = "name as many columns as there are joints, each by an expression of its own"
-            raise MeasurementError.of(what, expected="columns that the joints determine", got=got, fix=fix)
+            what, fix = f"columns to be written, {listed(self.columns)}", "name one for each joint"
+            raise MeasurementError.of(
+                what, expected=f"columns that the joints determine, {listed(self.texts)}", fix=fix
+            )
         return torch.linalg.solve(self.matrix, (values - self.offset).mT).mT
 
 
@@ -200,15 +199,12 @@ class PoseColumns:
         if not self.convention or self.is_program:
             return
         cells = torch.stack([table[name] for name in self.columns], 1)
-        cells[:, :3] /= per_metre
-        alike = [name for name in ALL_CONVENTIONS if numbers_of(name) == numbers_of(self.convention)]
-        for convention, angle in product(alike, ANGLE_UNITS):
-            other = replace(self, convention=convention, angle=angle)
-            if (convention, angle) != (self.convention, self.angle):
-                with suppress(DiffeoCalibError):  # numbers that are no rotation in this convention
-                    poses = other.poses(cells)
-                    machine = cartesian(poses)
-                    yield machine, pose_inputs(machine, poses), f"--robot-pose {other.text} --angle {angle}"
+        for convention, angle, turns in readings_of(cells[:, 3:]):
+            poses = transforms(turns, cells[:, :3] / per_metre)
+            if convention != self.convention or (cells.shape[1] == 6 and angle != self.angle):
+                with suppress(DiffeoCalibError):  # turns that no machine has
+                    text = f"--robot-pose {replace(self, convention=convention).text} --angle {angle}"
+                    yield (machine := cartesian(poses)), pose_inputs(machine, poses), text
 
     def values(self, cells: Tensor) -> Tensor:
         """Cells (N, c) -> joint values (N, n), in the units of the table; without a machine the cells themselves."""
@@ -251,8 +247,7 @@ def _made(program: str, cells: Tensor) -> Tensor:
     lost = (~output.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
     if lost:
         fix = "leave these rows out, or check the unit of their columns"
-        what = f"what {program} returns of row {few(lost)}"
-        raise MeasurementError.of(what, expected="finite numbers", got="NaN or infinity", fix=fix)
+        raise MeasurementError.of(f"what {program} returns of row {few(lost)}", expected="finite numbers", fix=fix)
     some = torch.arange(0, len(cells), max(2, -(-len(cells) // COMPARED_ROWS)), device=cells.device).flip(0)
     again = made(cells[some])
     if again.shape != output[some].shape or not _alike(_flat(again), _flat(output[some])):

@@ -25,21 +25,15 @@ from diffeo_calib.measurements.csv.cells import csv_text, number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text, names_of
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
-Lines = list[tuple[int, list[str]]]
-"""Line number in the file and cells of every line that is not blank."""
+Lines = list[tuple[int, list[str]]]  # line number in the file and cells of every line that is not blank
 
 Cells = Sequence[Sequence[float | str]]
 Column = Sequence[str] | Sequence[float]
 
-HEAD = 200
-"""Lines among which the header is."""
-MOST_COLUMNS = 50_000
-"""Of a table of configurations."""
+HEAD = 200  # lines among which the header is
 NO_TABLES = {".json", ".yaml", ".yml", ".xml"}
-QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"
-"""Quotation marks, dashes and the like in cp1252."""
-AT_ONCE = 1 << 13
-"""Bytes by which a file is judged."""
+QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"  # quotation marks, dashes and the like in cp1252
+AT_ONCE = 1 << 13  # bytes by which a file is judged
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
@@ -48,8 +42,7 @@ LENGTHS = {name: name for name in ("m", "mm", "cm", "um", "inch")}
 LENGTHS |= {"µm": "um", "in": "inch", "毫米": "mm", "厘米": "cm", "米": "m"}
 ANGLES = {name: name for name in ("rad", "mrad", "deg", "gon")}
 ANGLES |= {"radians": "rad", "弧度": "rad", "°": "deg", "degree": "deg", "degrees": "deg", "度": "deg"}
-UNITS = LENGTHS | ANGLES
-"""Units as they are written, and their names."""
+UNITS = LENGTHS | ANGLES  # units as they are written, and their names
 LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\)?", re.DOTALL)
 """A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
 UNQUOTED = r"(?m)(^|{0})[ \t]*([\[(][-+\d.][^\[\]()\n]*[\])])[ \t]*(?={0}|\r?$)"
@@ -91,9 +84,6 @@ class CsvLines:
         self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
         self._lists = _lists(lines := list(islice(self._cells(), HEAD)))
         lines = list(islice(self._cells(), HEAD)) if self._lists else lines
-        if (width := max((len(cells) for _, cells in lines), default=0)) > MOST_COLUMNS:
-            what, fix = f"file '{path}'", "check the separator (`sep`); one row is one configuration"
-            raise MeasurementError.of(what, expected=f"at most {MOST_COLUMNS} columns", got=width, fix=fix)
         each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
         if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True
@@ -127,9 +117,8 @@ class CsvLines:
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
         if bad:
-            what = f"file '{self.path}', line {few([line for line, _ in bad])}"
-            fix = "repair these lines (a cell that holds the separator must be quoted)"
-            raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
+            what, got = f"file '{self.path}', line {few([line for line, _ in bad])}", f"{bad[0][1]}; quote separators"
+            raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=got)
         if not kept:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
@@ -229,20 +218,12 @@ def _text(path: Path, sep: str) -> tuple[str, list[str], str]:
         raise MeasurementError.of(what, expected="a CSV file", fix=fix)
     try:
         return data.decode("utf-8-sig"), [], sha256
-    except UnicodeDecodeError:
-        page = _code_page(data)
+    except UnicodeDecodeError:  # Chinese has pairs of high bytes, usual ones below 0xD8; Japanese begins with others
+        words = [word for word in re.findall(rb"[\x80-\xff]+", data) if word.strip(QUOTES)]
+        pairs = words and all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words) and min(words)[0] < 0xD8
+        japanese = 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words)
+        page = "gb18030" if pairs else "cp932" if japanese else "cp1252"
         return data.decode(page, "replace"), [f"text in {page}, not UTF-8"], sha256
-
-
-def _code_page(data: bytes) -> str:
-    """The code page of a text that is not UTF-8: Chinese has pairs of high bytes, Japanese begins them with others.
-
-    Bytes of quotation marks tell nothing. The pair in "Größe" would be a rare character; usual ones begin below 0xD8.
-    """
-    words = [word for word in re.findall(rb"[\x80-\xff]+", data) if word.strip(QUOTES)]
-    if words and all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words) and min(words)[0] < 0xD8:
-        return "gb18030"
-    return "cp932" if 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words) else "cp1252"
 
 
 class TextTable(NamedTuple):

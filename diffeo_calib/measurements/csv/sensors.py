@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,7 +14,17 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Column, Columns
+from diffeo_calib.measurements.csv.columns import (
+    DEVIATION,
+    POSITIONS,
+    ROTATION_STD,
+    ROTATIONS,
+    STD,
+    Body,
+    Check,
+    Column,
+    Columns,
+)
 from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.observations import WITH_POSITION
@@ -27,8 +37,7 @@ from diffeo_calib.measurements.poses import (
     to_spherical,
     transforms_of_frames,
 )
-from diffeo_calib.measurements.readings import MILLIMETRES, Readings
-from diffeo_calib.measurements.sockets import SEPARATOR, Distances, SocketReadings
+from diffeo_calib.measurements.readings import MILLIMETRES, SEPARATOR, Distances, Readings, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ZERO, TableFormat, column_names, flat_names, numbers_of
 
@@ -45,33 +54,22 @@ Written = tuple[dict[str, Tensor], Mapping[str, Sequence[str]], Tensor]
 
 
 class SensorColumns:
-    """The columns of rows of one kind; ``word``: name of the contents of a row, such as "a position"."""
+    """The columns of rows of one kind; ``word``: name of the contents of a row, such as "a position".
+
+    Of lines ``filled`` is which of them hold such a row, (N,) boolean; ``table`` their rows, and the first line of
+    each; ``written`` is the inverse of ``table``; joints, payloads and covariates are those of the rows.
+    """
 
     word: ClassVar[str]
-    hidden: ClassVar[bool] = False
-    """Whether rows may show some of it alone, and leave the other cells empty."""
-    texts: Mapping[str, bool]
-    """Columns of texts, and whether a table must have them."""
+    hidden: ClassVar[bool] = False  # whether rows may show some of it alone, and leave the other cells empty
+    texts: Mapping[str, bool]  # columns of texts, and whether a table must have them
+    filled: Any
+    table: Any
+    written: Any
 
     def bodies(self, table: TableFormat) -> Sequence[Body]:
         """The columns of numbers beside joints, payloads and covariates."""
         return ()
-
-    filled: Any
-    """Lines -> (N,) boolean, which of them hold such a row."""
-    table: Any
-    """Lines, all of which hold one -> their rows, and the first line of each."""
-    written: Any
-    """The inverse of ``table``; joints, payloads and covariates are those of the rows."""
-
-
-class OfBody(NamedTuple):
-    """Columns of a marker or frame: place, rotation, and deviations of both, which may be those of all bodies."""
-
-    place: Sequence[str]
-    turn: Sequence[str]
-    std: Sequence[str]
-    turn_std: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -87,67 +85,59 @@ class PositionColumns(SensorColumns):
         return {name: True for name in names if name is not None}
 
     @cached_property
-    def each(self) -> list[OfBody]:
+    def each(self) -> list[Body]:
         """The columns of every marker or frame; MeasurementError for numbers of names that do not match."""
         form, count = self.form, len(self.form.triples)
-        turn, turn_std = flat_names(form.rotation), flat_names(form.rotation_std)
-        for name, lists in (("rotation", form.rotation or ()), ("rotation_std", form.rotation_std or ())):
-            one_for_all = name == "rotation_std" and len(turn_std) == 1
-            if not one_for_all and len(lists) not in (0, count):
-                got = f"{count} triples and {len(lists)} list{'s' * (len(lists) != 1)} of columns in `{name}`"
-                fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
-                what, expected = f"`position` beside `{name}`", "one triple of columns for each"
-                raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+        for name in (ROTATIONS[:-1], ROTATION_STD):
+            lists: Any = getattr(form, name) or ()
+            if len(flat_names(lists)) > 1 and len(lists) != count:
+                expected, fix = "a list for each position", "name those of every frame, or leave the rotations out"
+                raise MeasurementError.of(f"`{name}`", expected=expected, got=as_written(lists), fix=fix)
         std: Any = form.std if isinstance(form.std, str) else flat_names(form.std) or form.std
         if std is not None:
             expected = "names of columns: one, one per marker or three per marker"
-            std = column_names("std", std, expected, (1, count, 3 * count))
+            std = column_names(STD, std, expected, (1, count, 3 * count))
         if form.spherical and std and len(std) == 3 * count:  # deviations are along x, y and z
-            fix = "name one for all directions, in the unit of `length`, or leave them out: the noise is estimated"
-            what = "`std` of a distance and two angles"
-            raise MeasurementError.of(what, expected="one column for each marker", got=listed(std), fix=fix)
-
-        def of_body(names: Sequence[str], k: int) -> Sequence[str]:
-            each = len(names) // count
-            return names[k * each : (k + 1) * each] if each else names
-
-        every = flat_names(form.triples), turn, std or (), turn_std
-        return [OfBody(*(of_body(names, k) for names in every)) for k in range(count)]
+            fix = "name one for all directions of each marker, or leave them out: the noise is estimated"
+            raise MeasurementError.of("`std` of a distance and two angles", got=listed(std), fix=fix)
+        unit, turned = form.rotation_angle or "rad", form.convention is not None and numbers_of(form.convention) == 3
+        parts = (
+            (flat_names(form.triples), Column("", form.length, role=POSITIONS)),
+            (flat_names(form.rotation), Column("", unit if turned else None, role=ROTATIONS)),
+            (std or (), Column("", form.length, DEVIATION, STD)),
+            (flat_names(form.rotation_std), Column("", unit, DEVIATION, ROTATION_STD)),
+        )
+        bodies, word = list[Body](), f"shows this {'frame' if form.rotation else 'marker'}"
+        for k in range(count):
+            of_each = [(names, len(names) // count, column) for names, column in parts]  # or those of all
+            own = [(names[k * n : k * n + n] if n else names, column) for names, n, column in of_each]
+            columns = [column._replace(name=name) for names, column in own for name in names]
+            if form.spherical:
+                columns[1:3] = [column._replace(unit=form.spherical.rpartition("_")[2]) for column in columns[1:3]]
+            bodies.append(Body(columns, word))
+        return bodies
 
     def bodies(self, table: TableFormat) -> list[Body]:
         """Deviations of all belong to none of several, nor does a coordinate that is 0 in all rows."""
-        form, unit, word = self.form, self.form.rotation_angle or "rad", "frame" if self.form.rotation else "marker"
-        angles = form.convention is not None and numbers_of(form.convention) == 3  # no quaternion or matrix
-        kinds = (
-            Column("", form.length, what="positions"),
-            Column("", unit, what="rotations") if angles else Column(""),
-            Column("", form.length, DEVIATION),
-            Column("", unit, DEVIATION),
-        )
-        each = [
-            [kind._replace(name=name) for names, kind in zip(body, kinds, strict=True) for name in names]
-            for body in self.each
-        ]
-        if form.spherical:
-            unit = form.spherical.rpartition("_")[2]
-            each = [[body[0], *(Column(column.name, unit) for column in body[1:3]), *body[3:]] for body in each]
-        some = dict.fromkeys(one for body in each for one in body if one.check == DEVIATION or one.name == ZERO)
-        shared = [column for column in some if sum(column in body for body in each) > 1]
-        bodies = [Body([column for column in body if column not in shared], f"shows this {word}") for body in each]
-        return [*bodies, Body(shared, "")]
+        some = dict.fromkeys(c for body in self.each for c in body.columns if c.check == DEVIATION or c.name == ZERO)
+        shared = [column for column in some if sum(column in body.columns for body in self.each) > 1]
+        own = [body._replace(columns=[c for c in body.columns if c not in shared]) for body in self.each]
+        return [*own, Body(shared, "")]
 
     def filled(self, rows: FileRows) -> Tensor:
-        return torch.stack([~rows.numbers(body.place[:1]).isnan()[:, 0] for body in self.each]).any(0)
+        return torch.stack([~rows.numbers(body.columns[:1]).isnan()[:, 0] for body in self.each]).any(0)
 
     def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
         """MeasurementError for numbers that do not form a rotation."""
         form, names, joints = self.form, None, rows.columns.joints.texts
-        places = (rows.numbers(body.place) for body in self.each)
+        places = (rows.numbers(body.of(POSITIONS)) for body in self.each)
         points = torch.stack([torch.cat([xyz, 0.0 * xyz[:, : 3 - xyz.shape[1]]], 1) for xyz in places], 1)  # in a plane
         points = from_spherical(points, form.spherical) if form.spherical else points
         std, turn_std = (
-            torch.stack([rows.numbers(body[k]).expand(-1, 3) for body in self.each], 1) if self.each[0][k] else None
-            for k in (2, 3)
+            torch.stack([rows.numbers(body.of(role)).expand(-1, 3) for body in self.each], 1)
+            if self.each[0].of(role)
+            else None
+            for role in (STD, ROTATION_STD)
         )
         if form.marker is not None:
             first, at, names = self._markers(rows, form.marker)
@@ -159,10 +149,8 @@ class PositionColumns(SensorColumns):
         else:
             poses = of_frames(transforms_of_frames(self._rotations(rows, form.convention), points))
             spreads = [spread if spread is None or len(self.each) > 1 else spread[:, 0] for spread in (std, turn_std)]
-            how = {"lever": form.lever, "position_std": spreads[0], "rotation_std": spreads[1]}
-            data = Measurements.from_poses(
-                rows.q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False
-            )
+            how: Any = {"lever": form.lever, "position_std": spreads[0], "rotation_std": spreads[1], "doubt": False}
+            data = Measurements.from_poses(rows.q, poses, joints, camera_on_tool=form.camera_on_tool, **how)
         set_ups = rows.devices(form.session, "a name")
         return data.with_tips(form.on).with_sessions(set_ups, remounted=form.remounted), rows
 
@@ -191,13 +179,14 @@ class PositionColumns(SensorColumns):
 
     def _rotations(self, rows: FileRows, convention: str) -> Tensor:
         """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
-        numbers = torch.stack([rows.numbers(body.turn) for body in self.each], 1)
+        numbers = torch.stack([rows.numbers(body.of(ROTATIONS)) for body in self.each], 1)
         visible = ~numbers.isnan().any(2)
         shown = visible.nonzero().tolist()
 
         def place(number: int) -> str:
             row, frame = shown[number]
-            return f"file '{rows.path}', line {rows.lines[row]}, columns {', '.join(self.each[frame].turn)}"
+            names = ", ".join(column.name for column in self.each[frame].of(ROTATIONS))
+            return f"file '{rows.path}', line {rows.lines[row]}, columns {names}"
 
         rotations = numbers.new_full((*visible.shape, 3, 3), torch.nan)
         with of_measurements():
@@ -210,9 +199,14 @@ class PositionColumns(SensorColumns):
         """Places (N, B, 3), rotations of frames (N, B, 4, 4), and deviations (N, B, 3), in SI, by their columns."""
         places = to_spherical(places, self.form.spherical) if self.form.spherical else places
         turns = None if frames is None else rotation_numbers(frames[..., :3, :3], self.form.convention or "rotvec")
-        parts = [(k, part) for k, part in enumerate((places, turns, std, turn_std)) if part is not None]
-        each = ((part[:, body], names[k]) for body, names in enumerate(self.each) for k, part in parts)
-        return {name: column for part, names in each for name, column in zip(names, part.T, strict=True)}
+        parts = {POSITIONS: places, ROTATIONS: turns, STD: std, ROTATION_STD: turn_std}
+        each = (
+            (body.of(role), part[:, k].T)
+            for k, body in enumerate(self.each)
+            for role, part in parts.items()
+            if part is not None
+        )
+        return {column.name: values for pairs in each for column, values in zip(*pairs, strict=True)}
 
     def written(self, part: Any, table: TableFormat) -> Written:
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
@@ -288,13 +282,10 @@ class ReadingColumns(SensorColumns):
         """Raise MeasurementError for a number of columns that does not match the kind, and a lens of no image."""
         if self.kind in (*WITH_POSITION, "socket"):
             expected = "a kind of readings, such as 'distance', 'height' or 'image'"
-            raise MeasurementError.of(
-                "`kind`", expected=expected, got=self.kind, fix="name it by `position` or `socket`"
-            )
+            raise MeasurementError.of("`kind`", expected=expected, got=self.kind, fix="name its columns otherwise")
         if (self.intrinsics is None) != (self.kind != "image"):
             fix = "pass fx, fy, cx, cy in pixels" if self.kind == "image" else "leave it out"
-            got = as_written(self.intrinsics)
-            raise MeasurementError.of(f"`intrinsics` of {self.kind!r}", got=got, fix=fix)
+            raise MeasurementError.of(f"`intrinsics` of {self.kind!r}", got=as_written(self.intrinsics), fix=fix)
         count = {"distance": 1, "height": 1, "image": 2}.get(self.kind, 0)
         for name, allowed in (("values", (count,)), ("std", (0, 1, count))):
             given: Any = getattr(self, name)
@@ -323,21 +314,26 @@ class ReadingColumns(SensorColumns):
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
-            return ~rows.numbers(self.values).isnan().any(1)
+            return ~rows.numbers(self.bodies(rows.columns.table)[0].values).isnan().any(1)
         if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
         return rows.filled(self.device)
 
     def table(self, rows: FileRows) -> tuple[Readings, FileRows]:
-        q, joints, table = rows.q, rows.columns.joints.texts, rows.columns.table
+        q, joints, table, (body,) = (
+            rows.q,
+            rows.columns.joints.texts,
+            rows.columns.table,
+            self.bodies(rows.columns.table),
+        )
         per_si = Column("", self.unit_in(table)).per_si
         if isinstance(self.values, tuple):
-            values = rows.numbers(self.values)
+            values = rows.numbers(body.values)
         else:
             values = torch.full((len(q), 1), float(self.values) / per_si, dtype=torch.float64, device=HOST)
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.numbers(self.std).expand_as(values) if self.std else None
+        std = rows.numbers(body.columns[-len(self.std) :]).expand_as(values) if self.std else None
         given, options = (q, values, devices, joints), {"std": std, "doubt": False}
         if (lens := self.intrinsics) is not None:
             data = Readings.images(*given, focal=lens[:2], centre=lens[2:], **options)
@@ -372,20 +368,12 @@ class ImageColumns(SensorColumns):
     device: str | None = None
     word = "an image"
 
-    @classmethod
-    def of(cls, data: Any, session: str | None) -> ImageColumns:
-        """How to read images that are written, with this column of set-ups."""
-        several = len(data.cameras) > 1
-        session = None if not data.session_names or (several and data.device_names == data.camera_names) else session
-        sizes = {name: (camera.width, camera.height) for name, camera in data.cameras.items()}
-        return cls(sizes if several else sizes.popitem()[1], data.board is not None, session)
-
     @property
     def texts(self) -> Mapping[str, bool]:
         return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
 
     def bodies(self, table: TableFormat) -> list[Body]:
-        columns = [Column(name, table.length) for name in POINT] + [Column(name) for name in PIXEL]
+        columns = [*(Column(name, table.length) for name in POINT), *map(Column, PIXEL)]
         return [Body(columns, f"holds {self.word}")]
 
     def filled(self, rows: FileRows) -> Tensor:
@@ -401,16 +389,15 @@ class ImageColumns(SensorColumns):
         for name, indices in images.items():
             other = (q[indices] != q[indices[0]]).any(1).nonzero()[:, 0].tolist()
             if other:
-                what = f"file '{rows.path}', image '{name}'"
-                got = f"other ones in line {few([rows.lines[indices[row]] for row in other])}"
+                what, got = f"file '{rows.path}', image '{name}'", few([rows.lines[indices[row]] for row in other])
                 fix = "give every image a name of its own, and its joint values in all of its lines"
-                raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
-        points, pixels = rows.numbers(POINT), rows.numbers(PIXEL)
-        flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
-        empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
-        if empty:
-            bad = [(rows.lines[row], (*POINT, *PIXEL)[k], "") for row, k in empty]
+                raise MeasurementError.of(what, expected="the same joint values", got=f"others in line {got}", fix=fix)
+        ((columns, _),) = self.bodies(rows.columns.table)
+        flat = rows.numbers(columns)
+        if empty := flat.isnan().nonzero().tolist():
+            bad = [(rows.lines[row], columns[k].name, "") for row, k in empty]
             raise bad_cells(rows.path, bad, "a number", "fill it in, or delete the line")
+        flat = torch.cat([flat[:, :2], torch.zeros_like(flat[:, :1]), flat[:, 2:]], 1)
         corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
         for number, indices in enumerate(images.values()):
             corners[number, : len(indices)] = flat[indices]
@@ -454,7 +441,7 @@ def columns_of(table: TableFormat) -> Columns:
     options = "rotation", "rotation_std", "std", "camera_on_tool", "remounted", "session"
     names = [f"`{name}`" for name in options if getattr(table, name) not in (None, False)]
     if table.position is None and names:
-        beside = "socket" if table.sockets is not None else "readings"
+        what = f"{' and '.join(names)} beside `{'socket' if table.sockets is not None else 'readings'}`"
         fix = "leave it out: no position was measured; sockets of another set-up are other places"
-        raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)
+        raise MeasurementError.of(what, fix=fix)
     return Columns.of(table, sensors)

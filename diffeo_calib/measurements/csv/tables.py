@@ -17,17 +17,18 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, find_columns, number_hint, numbers_in
-from diffeo_calib.measurements.csv.columns import Body, Columns
+from diffeo_calib.measurements.csv.columns import POSITIONS, Body, Column, Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, Lines, stated_unit
 from diffeo_calib.measurements.poses import (
     POINTS,
     inverse_poses,
     points_of_frames,
+    readings_of,
     rotation_matrices,
     transforms_of_frames,
 )
-from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, ZERO, flat_names, options_of
+from diffeo_calib.measurements.table_format import ANGLE_UNITS, UNITS_PER_METRE, ZERO, flat_names, options_of
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,7 @@ class TableOrigin:
         return dict(zip(file.header, map(list, zip(*wanted, strict=True)), strict=True))
 
 
-FEW_ROWS = 2000
-"""Rows among which those of a marker that was not seen are looked for."""
+FEW_ROWS = 2000  # rows among which those of a marker that was not seen are looked for
 MUCH_FARTHER = 3.0
 """Times the largest distance of a row from its nearest one: so far is a single 0, 0, 0 where it is no position."""
 
@@ -100,15 +100,17 @@ class FileRows(NamedTuple):
         joints = self.columns.joints
         return joints.values(self.raw[:, : len(joints.columns)]) / self.columns.per_joint
 
-    def numbers(self, names: Sequence[str]) -> Tensor:
+    def numbers(self, some: Sequence[Column]) -> Tensor:
         """(N, k) numbers of some columns, in SI."""
-        columns = [column for name in names for column in self.columns.numbers if column.name == name]
-        return self.raw[:, self.columns.places(columns)] / self.raw.new_tensor([column.per_si for column in columns])
+        read = self.columns.read(some)
+        return self.raw[:, self.columns.places(read)] / self.raw.new_tensor([column.per_si for column in read])
 
     @property
     def beside(self) -> dict[str, Tensor]:
         """(N,) payloads, times and temperatures, of those that are named."""
-        return {name: self.numbers([column.strip()])[:, 0] for name, column in self.columns.table.beside.items()}
+        names = {name: column.strip() for name, column in self.columns.table.beside.items()}
+        by_name = {column.name: column for column in self.columns.numbers}
+        return {name: self.numbers([by_name[column]])[:, 0] for name, column in names.items()}
 
     def filled(self, column: str) -> Tensor:
         """(N,) boolean, which rows have a text in a column."""
@@ -170,9 +172,8 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
         warn_user(f"file '{path}': {text}")
     for body in columns.hideable:
         if bool(numbers[:, columns.places(body.values)].isnan().all()):
-            names = few([column.name for column in body.values])
-            what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
-            raise MeasurementError.of(what, expected=f"some line that {body.word}", fix=fix)
+            what = f"file '{path}', columns {few([column.name for column in body.values])}: empty in all lines"
+            raise MeasurementError.of(what, expected=f"some line that {body.word}", fix="leave them out")
     markers = columns.hideable[: len(columns.table.triples)]
     for body in markers if zeros else ():
         _hide_marks(path, columns, numbers, lines, body)
@@ -259,7 +260,7 @@ def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[i
     One row at 0, 0, 0 may be the frame's origin, or the first pose: all others must be farther from it than from one
     another. Another number must stand in rows of several configurations.
     """
-    at = columns.places([column for column in body.columns if column.what == "positions"])
+    at = columns.places([column for column in body.of(POSITIONS) if column.unit == columns.table.length])
     points, q = numbers[:, at], numbers[:, : len(columns.joints.columns)]
     alike = (points == points[:, :1]).all(1) & ((points[:, 0] == 0.0) | (len(at) > 1))  # a distance alone may repeat
     for mark in points[alike, 0].unique().tolist():
@@ -290,9 +291,10 @@ def _check_units(file: CsvLines, columns: Columns) -> None:
         stated |= {name: None for name, _ in units if stated[name] not in ANGLES}
     wrong = [name for name, unit in read.items() if isinstance(unit, str) and stated[name] not in (None, unit)]
     for name in sorted(wrong, key=lambda name: stated[name] in (*UNITS_PER_METRE, *ANGLE_UNITS)):  # cm, inch first
-        what, fix = f"file '{file.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
-        got = f"{stated[name]} in the file"
-        raise MeasurementError.of(what, expected=f"{read[name]}, as stated", got=got, fix=fix)
+        what, expected = f"file '{file.path}', column '{shown(name)}'", f"{read[name]}, as stated"
+        raise MeasurementError.of(
+            what, expected=expected, got=f"{stated[name]} in the file", fix="state the unit of the file, or convert it"
+        )
 
 
 # --- other ways to read a table
@@ -359,21 +361,17 @@ def _rewritten(data: Any) -> Iterator[tuple[Tensor, str, str]]:
     names = () if columns is None else flat_names(columns.table.rotation)
     if columns is None or columns.table.convention is None or not all(name in table for name in names):
         return
-    convention, unit = columns.table.convention, columns.table.rotation_angle or "rad"
-    frames = len(columns.table.triples)
-    numbers = torch.stack([table[name] for name in names], dim=1).unflatten(1, (frames, -1))
-    count, flat = numbers.shape[2], numbers.flatten(0, 1)
-
-    def read(values: Tensor, convention: str, angle: str) -> Tensor:
-        return rotation_matrices(values, convention, angle=angle).unflatten(0, (-1, frames))
-
-    families = {3: (*EULER, "rotvec"), 4: ("quat_xyzw", "quat_wxyz"), 9: ("matrix",)}
-    for other in families[count]:
-        if other != convention:
-            yield read(flat, other, unit), "", f"convention='{other}'"
-    if count == 3:
-        other = "deg" if unit == "rad" else "rad"
-        yield read(flat, convention, other), "", f"rotation_angle='{other}'"
-        for order in list(permutations(range(3)))[1:-1]:  # the last, reversed Euler angles, is a convention by itself
-            words = f"the rotation columns seem to be in the order {shown(','.join(names[k] for k in order))}"
-            yield read(flat[:, list(order)], convention, unit), words, ""
+    convention, frames = columns.table.convention, len(columns.table.triples)
+    flat = torch.stack([table[name] for name in names], dim=1).view(len(data) * frames, -1)
+    unit = columns.table.rotation_angle if flat.shape[1] == 3 else "rad"  # others have none
+    for other, angle, rotations in readings_of(flat):
+        if (other == convention) != (angle == unit):
+            option = f"rotation_angle='{angle}'" if other == convention else f"convention='{other}'"
+            yield rotations.unflatten(0, (-1, frames)), "", option
+    for order in list(permutations(range(3)))[1:-1] if flat.shape[1] == 3 else ():  # the last is a convention by itself
+        words = f"the rotation columns seem to be in the order {shown(','.join(names[k] for k in order))}"
+        yield (
+            rotation_matrices(flat[:, list(order)], convention, angle=unit or "rad").unflatten(0, (-1, frames)),
+            words,
+            "",
+        )

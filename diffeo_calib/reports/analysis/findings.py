@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.judged_rows import common_cause, judge
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, common_cause, flagged, judge
 from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors
 from diffeo_calib.calibration.result import Part, parts
 from diffeo_calib.common.device import HOST
@@ -259,7 +258,8 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     errors = {name: residuals(stages[name], place(stages[name], data), data) for name in before}
     errors[last] = Evaluations.of([(predicted.errors, torch.arange(len(predicted), device=HOST))])
     outliers = predicted.outliers(model)
-    cause = common_cause(model, data, outliers) if model.registration is None else None  # else they are elsewhere
+    wrong = flagged(len(data), outliers)
+    cause = common_cause(model, data, wrong) if model.registration is None else None  # else they are elsewhere
     kinds, moved = _by_kind(errors, data.q), [cause] if cause else []
     return {"kinds": kinds, "new": False, "predictions": predicted, "outliers": outliers, "moved": moved}
 

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, excluded, found_outliers
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above, known

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
+from diffeo_calib.calibration.diagnostics.judged_rows import outlier_lines
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
