@@ -44,7 +44,7 @@ from robot_data import data_folder, find, read
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.knowledge import of_model
+from diffeo_calib.calibration.planning.scene import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

@@ -39,7 +39,6 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
@@ -115,7 +114,7 @@ def real(name: str, folder: Path) -> Iterator[Record]:
     for number, left_out in enumerate(data.sockets.place_names):
         result, methods = calibrated(robot, data.rows(place != number))
         test = data.rows(place == number)
-        expected = None if result.sockets is None else 1e3 * workspace_deviation(result.model.map)
+        expected = None if result.sockets is None else 1e3 * result.expected.workspace
         for method, points in methods.items():
             found = dc.evaluate(points, test)
             distance = float(np.mean([abs(one.error) for one in found.distances]))

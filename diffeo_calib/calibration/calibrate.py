@@ -26,8 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
-from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, warn_of_taken_scales, worth_it
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge
 from diffeo_calib.calibration.diagnostics.judged_rows import (
     common_cause,
     flagged,
@@ -235,8 +235,6 @@ def _result(
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
     warn_of_outliers(outlying, placed.data)
     said = best and best.text
-    if best is None or not best.of_table:
-        said = placed.mislabelled(model, outlying) or said
     if placed.coordinates is not None:
         table, rows = placed.coordinates
         said = common_cause(model, table, flagged(len(data.x), outlying)[rows.to(HOST)], said)

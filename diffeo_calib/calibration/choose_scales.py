@@ -279,13 +279,8 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
         if overstated:
             fix = "the given standard deviations are larger than the errors: check `std` and its unit"
-        text = sentence(
-            "leave-one-out errors contradict the selected scales",
-            expected="squared errors of the predicted variance",
-            got=f"{ratio:.2g} times that",
-            fix=fix,
-        )
-        warn_user(text)
+        got, expected = f"{ratio:.2g} times that", "squared errors of the predicted variance"
+        warn_user(sentence("leave-one-out errors contradict the selected scales", expected=expected, got=got, fix=fix))
 
 
 POSES, COORDINATES = 300, 1500

@@ -40,15 +40,6 @@ from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import device_coordinates
 
 
-def workspace_deviation(fitted: FittedMap) -> float:
-    """Root mean square distance, m, between modelled and true positions that the model expects over its workspace.
-
-    Of the last marker, the ball, and with everything that the rows leave open.
-    """
-    covariance = fitted.posterior(fitted.everywhere, noise=False)[1]
-    return _distance(covariance[:, -3:, -3:])
-
-
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
     return model.map.unregistered.stands_free

@@ -34,13 +34,10 @@ from diffeo_calib.measurements.csv.cells import csv_text, number
 
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
 """Fields of a verdict in a journal."""
-LARGEST = 1e100
-"""Largest error, m."""
+LARGEST = 1e100  # largest error, m
 BEGUN = "begun"
-FIRST = b'{"begun": {'
-"""How a journal begins."""
-STILL_SECONDS = 5.0
-"""Time after which no program is writing half a line any more."""
+FIRST = b'{"begun": {'  # how a journal begins
+STILL_SECONDS = 5.0  # time after which no program is writing half a line any more
 
 
 class Journal(ExitStack):

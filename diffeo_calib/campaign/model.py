@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
-from diffeo_calib.calibration.planning.knowledge import greedy
+from diffeo_calib.calibration.planning.scene import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
 from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -42,10 +42,8 @@ from diffeo_calib.sensors.devices import CHANGE, Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
-MOST_COORDINATES = 4500
-"""Measured numbers of a posterior: of more rows a random sample stands for all."""
-EXCEEDANCE_PROBABILITY = 0.05
-"""Probability that the true error is above its limit."""
+MOST_COORDINATES = 4500  # measured numbers of a posterior: of more rows a random sample stands for all
+EXCEEDANCE_PROBABILITY = 0.05  # probability that the true error is above its limit
 INFORMATION_COORDINATES, LOG_SCALE_STEP = 450, 0.2
 """Measured numbers of random rows that say how certain scales are; step of a log scale between which they change."""
 UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: m as mm?"))
@@ -72,14 +70,7 @@ class Around:
 
     @classmethod
     def of(
-        cls,
-        robot: Tree,
-        rows: Any,
-        asked: tuple[Tensor, Tensor],
-        same: Around | None,
-        *,
-        first: bool,
-        seed: int,
+        cls, robot: Tree, rows: Any, asked: tuple[Tensor, Tensor], same: Around | None, *, first: bool, seed: int
     ) -> Around:
         """Around accepted rows.
 
@@ -236,14 +227,14 @@ class CampaignModel:
         around: places and scales. table: all rows. verdicts: on them. ratios: of accepted rows, see :attr:`typical`.
 
     Attributes:
-        seen: rows of the campaign when this was made. window: numbers of the last rows; ``numbers`` and
+        window: numbers of the last rows; ``numbers`` and
             ``noise`` are what these tell.
         process: what is known by the accepted rows but the last ones. now: by all of them.
         covariance: (T r, T r) of the errors over the target, m^2.
     """
 
     def __init__(self, around: Around, table: Any, verdicts: Sequence[Verdict], ratios: Sequence[float]) -> None:
-        self.around, self.seen, self.ratios = around, len(table), list(ratios)
+        self.around, self.ratios = around, list(ratios)
         placed, names = set(around.placed.data.device_names), table.device_names
         judged = [verdict for verdict in verdicts if names[verdict.row] in placed]
         accepted = [verdict.row for verdict in judged if verdict.accepted]
@@ -298,12 +289,15 @@ class CampaignModel:
         (at, noise), (_, compared), open_ = self.around.options, self.around.errors, self.around.open
         self._options = self.process.features(at, self._options)
         options, target = (self.now.features(part.at, part) for part in (self._options, self._target))
-        K, (M, r), place = options.between(), noise.shape[:2], torch.arange(len(noise), device=HOST)
-        cross, blocks = compared @ target.between(options), diagonal_blocks(K, M) + noise
-        how: Any = {"place": place, "open_": open_, "count": min(count, int(open_.sum()))}
-        order, by = greedy(cross, blocks, lambda row: K.view(M, r, -1)[row], **how)
+        how: Any = {
+            "place": torch.arange(len(noise), device=HOST),
+            "open_": open_,
+            "count": min(count, int(open_.sum())),
+        }
+        blocks = diagonal_blocks(options.between(), len(noise)) + noise
+        order, by = greedy(compared @ target.between(options), options, blocks, **how)
         variance = self.covariance.diagonal().mean()[None]
-        lowered = torch.cat([variance, -by.square().sum((1, 2)) / len(cross)]).cumsum(0)
+        lowered = torch.cat([variance, -by.square().sum((1, 2)) / len(compared)]).cumsum(0)
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
@@ -400,35 +394,32 @@ class CampaignModel:
         def fits(other: Seen, freedom: int) -> bool:
             return other.measure(freedom).fits(self.typical, gates.UNDONE_CHANCE)
 
-        for words, other in self._undone(table, data, view):
-            if fits(other, freedom):
+        undone = self._undone(table.q, data.y[0].view(bodies, -1), self.around.placed.registration.geometry.chain)
+        copies = table.rows([len(table) - 1] * len(undone))
+        others = self.around.rows(with_attributes(copies.parts[0], q=torch.stack([q for q, _ in undone.values()])))[0]
+        others = replace(others, y=torch.stack([y.flatten() for _, y in undone.values()]))
+        numbers, noise = self.around.told(others)
+        at = self.now.features(numbers.at)
+        for number, words in enumerate(undone):
+            row = _numbers(number, number + 1)
+            if fits(Seen.of(self.now, numbers.rows(row), noise[row], at.rows(row)), freedom):
                 return words
         body = view.numbers.cells * bodies // view.numbers.shape[1]
         good = [b for b in range(bodies) if fits(view.some(body != b), freedom * (bodies - 1) // bodies)]
         return f"marker {good[0]} seems to be wrong" if len(good) == 1 < bodies else ""
 
-    def _undone(self, table: Any, data: TangentData, view: Seen) -> Iterator[tuple[str, Seen]]:
-        """The last row with a mistake undone, in words: in its values, and in its joint values."""
-        values = [(f"its values seem to be {words}", factor * data.y) for factor, words in UNITS]
-        each = data.y.unflatten(1, (data.noise_model.bodies, -1))
-        for a, b in combinations(range(each.shape[1]), 2):
-            order = [{a: b, b: a}.get(k, k) for k in range(each.shape[1])]
-            values.append((f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)))
-        for words, other in values:
-            away = view.numbers.of_table(data.in_numbers((other - data.y)[..., None]))[:, 0]
-            yield words, view._replace(error=view.error + away)
-        q, chain = table.q[-1], self.around.placed.registration.geometry.chain
-        turning = torch.tensor(chain.periodic, dtype=torch.bool, device=HOST)
-        joints = {
-            "its joint values seem to be degrees as radians": torch.where(turning, q * pi / 180, q),
-            "its joint values seem to be converted to radians twice": torch.where(turning, q * 180 / pi, q),
-            "it seems to have been measured at the joint values of the row before": table.q[-2],
-        }
-        copies = table.rows([len(table) - 1] * len(joints))
-        others = self.around.rows(with_attributes(copies.parts[0], q=torch.stack([*joints.values()])))[0]
-        for number, words in enumerate(joints):
-            numbers, noise = self.around.told(others.rows(_numbers(number, number + 1)))
-            yield words, Seen.of(self.now, numbers, noise, self.now.features(numbers.at))
+    @staticmethod
+    def _undone(q: Tensor, y: Tensor, chain: Tree) -> dict[str, tuple[Tensor, Tensor]]:
+        """Joint values (n,) and values (bodies, numbers) of the last of some rows (N, n), by the mistake undone."""
+        turning, own = torch.tensor(chain.periodic, dtype=torch.bool, device=HOST), q[-1]
+        undone = {f"its values seem to be {words}": (own, factor * y) for factor, words in UNITS}
+        for a, b in combinations(range(len(y)), 2):
+            order = [{a: b, b: a}.get(k, k) for k in range(len(y))]
+            undone[f"markers {a} and {b} seem to be exchanged"] = own, y[order]
+        undone["its joint values seem to be degrees as radians"] = torch.where(turning, own * pi / 180, own), y
+        undone["its joint values seem to be converted to radians twice"] = torch.where(turning, own * 180 / pi, own), y
+        undone["it seems to have been measured at the joint values of the row before"] = q[-2], y
+        return undone
 
 
 def _flags(values: Sequence[bool]) -> Tensor:

@@ -197,14 +197,14 @@ def find_change(
     after = later & doubted  # (F, M) numbers, for each first row of a change
     used = after | (~later & accepted)
     effects = [view.numbers.of_table(hypothesis.effects) for hypothesis in hypotheses]
-    right = torch.cat([(view.error * used)[:, :, None], torch.cat(effects, 1) * after[:, :, None]], 2)
-    masks, which = used.unique(dim=0, return_inverse=True)
-    for number, mask in enumerate(masks):
-        part = which == number
-        root = torch.linalg.cholesky(torch.where(mask[:, None] & mask, view.covariance, torch.diag(~mask)))
-        columns = torch.linalg.solve_triangular(root, right[part].transpose(0, 1).flatten(1), upper=False)
-        right[part] = columns.unflatten(1, (-1, right.shape[2])).transpose(0, 1)
-    right *= after[:, :, None]  # given the rows before, which come first
+    every = torch.cat([view.error[:, None], *effects], 1)
+    right = every.new_zeros(*used.shape, every.shape[1])
+    for first, mask in enumerate(used):  # given the rows before, which come first
+        both = every[mask].clone()
+        both[:, 1:] *= after[first, mask, None]
+        root = torch.linalg.cholesky(view.covariance[mask][:, mask])
+        right[first, mask] = torch.linalg.solve_triangular(root, both, upper=False)
+    right *= after[:, :, None]
     white, W = right[:, :, 0], right[:, :, 1:]
     counts, total = after.sum(1).tolist(), (white.square().sum(1) / typical).tolist()
     g, H, candidates, start = (W.mT @ white[:, :, None])[..., 0], W.mT @ W, [], 0

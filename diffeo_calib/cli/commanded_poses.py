@@ -72,11 +72,8 @@ def poses_in(sheet: Sheet) -> list[Body]:
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
-    """Columns of the machine: by words of the names, reported ones before wished ones; else the first.
-
-    What is only said to be measured is the machine's where something else was seen as well.
-    """
-    seen = WORDS["seen"] - {"target"}
+    """Columns of the machine: by words of the names, reported ones before wished ones; else the first."""
+    seen = WORDS["seen"] - {"target"}  # beside it, what is only said to be measured is the machine's
     others = any(body.words & seen for body in bodies)
 
     def rank(body: Body) -> int:
@@ -154,10 +151,7 @@ def _as_good(way: Source, best: Source) -> bool:
 
 
 def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, str]) -> Iterator[Source]:
-    """The likeliest ways to read the table.
-
-    ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
-    """
+    """The likeliest ways to read the table; lengths of the machine and of what was measured are empty where sought."""
     place, turn, *_ = rows.bodies[0] if rows.bodies else Body([], [])
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(sheet, [name for names in groups for name in names])

@@ -155,7 +155,7 @@ class Source:
             return left / max(spread(session.points), SMALLEST_SPREAD_M)
         tables = self.data.parts
         for resting in resting_rows(tables):
-            rests = register_sockets(self.robot, resting.q, resting.device)
+            rests = register_sockets(Geometry.nominal(self.robot), resting.q, resting.device)
             ball = rests.positions[resting.device]
             around = float((ball - ball.mean(0)).norm(dim=1).median())
             return float(rests.distances.median()) / around if around > 0.0 else inf

@@ -1,8 +1,4 @@
-"""From the options of a command to the table that they describe, of whatever kinds its rows are.
-
-Later commands know how the rows of a model's fit were read: the command line that made it is kept with the model.
-Imports torch: only commands that run import this.
-"""
+"""From the options of a command, or of that which made a model, to the table that they describe. Imports torch."""
 
 from __future__ import annotations
 

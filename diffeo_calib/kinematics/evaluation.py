@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from math import inf
 from typing import Any
 
 import torch
@@ -17,15 +16,13 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
+from diffeo_calib.kinematics.joint_ranges import check_same_robot, fitted_configurations, repeats
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import Beside, Places, check_shown, known_devices, sensor_of
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind, with_points
-
-ROWS_AT_ONCE = 1024
 
 
 def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any) -> Evaluations:
@@ -99,17 +96,13 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
     Raises:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
-    fitted = fitted_configurations(model)
-    blocks = model.robot.joint_values(q).detach().split(ROWS_AT_ONCE)  # pyright: ignore[reportArgumentType]
-    return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
+    return repeats(model.robot.joint_values(q).detach(), fitted_configurations(model))  # pyright: ignore[reportArgumentType]
 
 
 def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(N,) which configurations took no part in the fit, nor in a registration."""
-    new = ~rows_used_in_fit(model, q)
-    if model.registration is not None:
-        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
-    return new.to(HOST)
+    known = rows_used_in_fit(model, q)
+    return ~(known if model.registration is None else known | repeats(q, model.registration.q)).to(HOST)
 
 
 def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
@@ -121,7 +114,7 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
         return 0
     rows = [devices.rows[devices.elsewhere.to(HOST)[devices.device]].to(q.device) for devices in model.placement]
     elsewhere = model.configurations[torch.cat(rows)] if rows else model.configurations[:0]
-    return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
+    return int(repeats(q, elsewhere).sum())
 
 
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:

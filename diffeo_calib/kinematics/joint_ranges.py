@@ -19,8 +19,8 @@ REPEATED = 1e-3
 """Distance [rad or m] within which rows repeat a configuration: robots do, and so do copies with fewer digits."""
 TELLING_ROWS, TELLING_MOTION = 10, 0.25
 """Rows, and their median range of a joint relative to the fit's, from which they move as those of the fit."""
-RANGE_MARGIN = 0.25
-"""Rows may lie outside the joint range of the fit by this fraction of the range."""
+ROWS_AT_ONCE = 1024
+RANGE_MARGIN = 0.25  # rows may lie outside the joint range of the fit by this fraction of the range
 
 
 def joints_outside_range(model: Any, q: object) -> Tensor:
@@ -60,9 +60,16 @@ def fitted_configurations(model: object) -> Tensor:
     return configurations
 
 
+def repeats(q: Tensor, others: Tensor, within: float = SAME_CONFIGURATION) -> Tensor:
+    """(N,) boolean: which configurations (N, n) are also among others (M, n)."""
+    others = others.to(q)
+    near = [(torch.cdist(block, others, p=inf) < within).any(1) for block in q.split(ROWS_AT_ONCE)]
+    return torch.cat(near)
+
+
 def repeated_lines(model: Any, q: Tensor) -> list[str]:
     """A sentence if configurations (N, n) are those of the fit: they say little about other poses."""
-    count = int((torch.cdist(q, fitted_configurations(model).to(q), p=inf).amin(1) <= REPEATED).sum()) if len(q) else 0
+    count = int(repeats(q, fitted_configurations(model), REPEATED).sum())
     what = f"{count} of {len(q)} rows repeat joint values of the fit: errors at other poses are larger, and copies of"
     return [f"{what} its rows, also with fewer digits, tell nothing new"] * bool(count)
 

@@ -17,8 +17,7 @@ from diffeo_calib.robots.se3 import skew
 from diffeo_calib.runtime.build import axis_waves, gear_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles, wave_slopes, wave_sums
 
-TURNS_FROM = 3
-"""Place of the first rotation in a twist; the translations are before it."""
+TURNS_FROM = 3  # place of the first rotation in a twist; the translations are before it
 
 
 class PositionErrors(NamedTuple):

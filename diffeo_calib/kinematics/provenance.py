@@ -11,10 +11,8 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
 
-HASH_SHOWN = 12
-"""Digits of a hash that a sentence shows."""
-LONGEST_NOTE = 10_000
-"""Characters of a note."""
+HASH_SHOWN = 12  # digits of a hash that a sentence shows
+LONGEST_NOTE = 10_000  # characters of a note
 
 
 @dataclass(frozen=True)
@@ -77,10 +75,8 @@ def package_version() -> str:
         return "unknown"
 
 
-LENGTH_UNIT = " [m]"
-"""Ends the names of the parts' entries."""
-INFINITE = "infinite"
-"""An infinite number among entries: JSON has none."""
+LENGTH_UNIT = " [m]"  # ends the names of the parts' entries
+INFINITE = "infinite"  # an infinite number among entries: JSON has none
 
 
 def _entry(name: str, default: Any = MISSING) -> Any:

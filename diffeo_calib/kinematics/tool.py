@@ -155,8 +155,7 @@ def pose_slopes(points: Tensor, slopes: Tensor) -> Tensor:
     return program.pose_slopes(points, slopes, poses_from_marks(points, TOOL_LEVER)[:, :3, :3], use)
 
 
-REFERENCE_ROWS = 40
-"""Most configurations of the model over which the two motions are found."""
+REFERENCE_ROWS = 40  # most configurations of the model over which the two motions are found
 SMALLEST_MOTION = 1e-9
 """Of a motion, relative to the largest: smaller ones are the same for base and tool, as a SCARA robot's lift is."""
 

@@ -18,23 +18,19 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.robots.tree import Tree
 
 
-def transmission(deformation: Deformation, robot: Tree, joint: str, values: object) -> Tensor:
-    """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m."""
-    x, index = _configurations(robot, joint, values)
-    nominal, smooth = deformation.spec.nominal, smooth_transmission(deformation, robot, joint, values)
-    turned = nominal.turned(x, deformation.momenta.theta) if isinstance(nominal, GeometryMap) else x
-    return smooth + (turned - x)[:, index]
+def transmission(deformation: Deformation, robot: Tree, joint: str, values: object, *, lines: bool = True) -> Tensor:
+    """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m.
 
-
-def smooth_transmission(deformation: Deformation, robot: Tree, joint: str, values: object) -> Tensor:
-    """The same without gear lines, for pictures whose points lie too far apart for them."""
+    Without gear ``lines`` for pictures whose points lie too far apart for them.
+    """
     x, index = _configurations(robot, joint, values)
-    terms = deformation.spec.joint_kernel.terms
+    terms, momenta, nominal = deformation.spec.joint_kernel.terms, deformation.momenta, deformation.spec.nominal
     of_joint = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
-    fields = (term.field(x, deformation.x, deformation.momenta.joint)[:, index] for term in of_joint)
-    nominal, error = deformation.spec.nominal, sum(fields, torch.zeros_like(x[:, index]))
-    theta = deformation.momenta.theta
-    return error + nominal.along_axis(x, index) @ theta if isinstance(nominal, GeometryMap) else error
+    error = sum((t.field(x, deformation.x, momenta.joint)[:, index] for t in of_joint), torch.zeros_like(x[:, index]))
+    if not isinstance(nominal, GeometryMap):
+        return error
+    error = error + nominal.along_axis(x, index) @ momenta.theta
+    return error + (nominal.turned(x, momenta.theta) - x)[:, index] if lines else error
 
 
 def _configurations(robot: Tree, joint: str, values: object) -> tuple[Tensor, int]:
@@ -49,10 +45,8 @@ def _configurations(robot: Tree, joint: str, values: object) -> tuple[Tensor, in
     return x, index
 
 
-SAME_RATIO = 0.5
-"""Difference of two frequencies, rad per rad, up to which one counts as a multiple of the other."""
-MULTIPLES = (2, 3, 4)
-"""Waves per turn of the motor that are named."""
+SAME_RATIO = 0.5  # difference of two frequencies, rad per rad, up to which one counts as a multiple of the other
+MULTIPLES = (2, 3, 4)  # waves per turn of the motor that are named
 
 
 @dataclass(frozen=True)

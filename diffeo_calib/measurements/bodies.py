@@ -1,8 +1,4 @@
-"""Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both.
-
-A body has an origin, the marker itself or that of its frame, and numbers that tell where it is: three coordinates, of
-frames a rotation vector too.
-"""
+"""Bodies seen on the tool, markers or frames that three points each represent: the only place that knows both."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Checks and copies of the arrays that make a table, sentences about values that look wrong, and checksums.
-
-Units must always be named. They are never guessed; values that look as if they were in another one cause a warning.
-"""
+"""Checks and copies of the arrays that make a table, sentences about values that look wrong, and checksums."""
 
 from __future__ import annotations
 

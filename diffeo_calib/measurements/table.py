@@ -1,8 +1,6 @@
-"""Measured pairs (joint configuration, marker positions or pose): the table, its subsets, splits and folds.
+"""Measured pairs (joint configuration, marker positions or pose). SI and float64: radians, metres.
 
-Everything is SI and float64: radians for revolute joints, metres for prismatic joints and for points. A measured pose
-is stored as a pose and as the three points that represent it (:mod:`diffeo_calib.measurements.poses`).
-:mod:`diffeo_calib.measurements.csv.files` reads and writes files in other units.
+A measured pose is stored as a pose and as the three points that represent it (:mod:`diffeo_calib.measurements.poses`).
 """
 
 from __future__ import annotations

@@ -144,7 +144,8 @@ class SocketPlaces(Devices):
         return f"{triple(1e3 * self.constants[number])} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        return f"socket '{self.names[number]}': {self.where(number)} in {frame}"
+        place = f"{triple(1e3 * self.constants[number])} +- {triple(1e3 * deviations)} mm in {frame}"
+        return f"socket '{self.names[number]}': {place}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def test_what_refuses_everything_is_named(robot: Chain, monkeypatch: pytest.Monk
     tracker, narrow = (dc.Tracker((3.0, 0.0, 0.5), half_angle=angle) for angle in (math.radians(30), 0.01))
     refused(
         (
-            r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` 9",
+            r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` refuses 9",
             lambda: dc.candidates(robot, 5, tracker=tracker, floor=5.0),
         ),
         ("^`keep` refuses", lambda: dc.candidates(robot, 5, keep=lambda q: q[:, 0] > 100.0, tracker=tracker)),

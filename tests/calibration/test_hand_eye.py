@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 import torch
-from product_bank import usual_scales
+from commanded_bank import BOARD, CAMERA, drawn, flange
+from commanded_bank import seen as seen_by_camera
+from product_bank import scales_of, usual_scales
 from simulated_camera import CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead
@@ -18,7 +20,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.poses import inverse_poses
-from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.robots.se3 import transforms, twist_transform
 
 ROWS, TEST_ROWS = 60, 100
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3
@@ -87,3 +89,23 @@ def test_the_optical_frame_is_where_it_is_in_the_link_of_the_camera() -> None:
     assert own.link == HEAD_CAMERA
     assert bool(((own.pose - truth)[:3, 3].abs() < 4 * own.deviations[:3]).all())
     assert float(own.deviations[:3].max()) < 3e-3
+
+
+@pytest.mark.parametrize("camera_on_tool", [True, False])
+def test_the_mean_error_of_an_arm_may_be_a_camera_or_a_board_elsewhere(camera_on_tool: bool) -> None:
+    """Of one that is off by more on average than its errors vary; what a perfect one sees is known well."""
+    commanded = flange()
+    machine = dc.cartesian(commanded)
+    q, few = dc.pose_inputs(machine, commanded), dict.fromkeys(("joint_noise", "transmission_amplitude"), 1e-6)
+    scales = scales_of(6, 6, coupled_lengthscale=0.3, coupled_amplitude=4e-4, sensor_noise=1e-4, **few)
+    mean = 1e-3 * torch.tensor([1.2, -0.8, 1.0, 0.5, 0.5, -0.5], dtype=torch.float64)
+    for size in (0.0, 1.0):
+        moved = twist_transform(size * (mean + 5e-4 * (3.0 * q @ drawn(6, 6, seed=1)).sin()))
+        true = transforms(moved[:, :3, :3] @ commanded[:, :3, :3], commanded[:, :3, 3] + moved[:, :3, 3])
+        there = seen_by_camera(true, camera_on_tool=camera_on_tool)
+        data = dc.Measurements.from_poses(q, there, camera_on_tool=camera_on_tool, doubt=False)
+        eye = HandEye.of(dc.calibrate(machine, data, hyperparameters=scales).model, camera_on_tool=camera_on_tool)
+        for own, truth in zip((eye.camera, eye.board), (CAMERA, BOARD)[:: 2 * camera_on_tool - 1], strict=True):
+            away = own.pose[:3, 3] - truth[:3, 3]
+            assert float((away / own.deviations[:3]).square().mean()) < 1.5**2, (size, own.where)
+            assert size > 0.0 or float(own.deviations[:3].max()) < 5e-4

@@ -17,8 +17,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import (
-    MeasuredPoints,
-    ReadRows,
+    KindRows,
     Rows,
     estimated,
     held_parameters,
@@ -128,7 +127,7 @@ def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
     q, points = arm.measure(30)
     data, test = readings(arm, "distance", 120, noise=2e-3), arm.sample(200, 9)
     start = register(arm.nominal, q, points).geometry
-    parts = MeasuredPoints.of(q, points), ReadRows(data, fitting_devices(data, start.points(data.q)))
+    parts = KindRows.positions(q, points), KindRows.read(data, fitting_devices(data, start.points(data.q)))
     found = [estimated(Rows(start, some), held_parameters(start)) for some in (parts[:1], parts)]
     alone, both = (rms(one.geometry.points(test) - arm.true_points(test)) for one in found)
     assert both < 1.1 * alone

@@ -104,8 +104,6 @@ def test_a_plan_can_be_made_in_parts() -> None:
         order = [*range(first), *reversed(range(first, last)), *range(last, 8)]
         assert float(moves[order[:-1], order[1:]].sum()) > float(moves.diagonal(1).sum()) - 1e-9
     assert bool((whole.expected_rms.diff() < 0).all())
-    assert whole.needed(float(whole.expected_rms[6])) == 6
-    assert whole.needed(0.0) is None
     assert "8 poses" in str(whole)
     assert "guesses" in str(whole)
 

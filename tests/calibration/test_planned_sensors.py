@@ -89,7 +89,7 @@ def test_devices_of_a_fit_against_the_whole_covariance(name: str) -> None:
     sensors: Any = sensor_of(result.model)
     known = result.placement[0].devices.constants
     told = slice(0, 3 if name == "heights" else None)  # the distance of a plane changes no slope
-    found = {one.names[0]: one.devices[0].devices.constants for one in sensors}
+    found = {name: device.devices.constants for one in sensors for name, device in one.devices.items()}
     own = {name: int((known - constants)[:, told].norm(dim=1).argmin()) for name, constants in found.items()}
     order = plan.rank.argsort()
     taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]

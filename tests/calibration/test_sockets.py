@@ -18,15 +18,17 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices, other_socket
+from diffeo_calib.calibration.placing.readings import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.readings import SocketReadings
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
 DISTANCES = {("0", "1"): 0.05}
@@ -171,13 +173,6 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
             place(plain.nominal, table(some, **options), silent)
 
 
-def test_a_row_in_a_socket_says_why_it_is_far() -> None:
-    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-    seen = torch.tensor([[1.0, 1e-3, 0.0], [0.0, 0.4, 0.0]], dtype=torch.float64)
-    assert "'b/0'" in other_socket(seen[0], places, ("a/0", "b/0"), 0.01)
-    assert "its socket" in other_socket(seen[1], places, ("a/0", "b/0"), 0.01)
-
-
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
     names = list(some.names)
     names[3], names[20] = "2/1", "0/0"
@@ -192,6 +187,15 @@ def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: Sock
     names = tuple(some.names[(7 * row) % 36] for row in range(36))
     with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
         place(plain.nominal, table(some, names), silent)
+
+
+def test_a_tool_that_never_turns(plain: SimulatedArm, some: SocketRows) -> None:
+    q = some.q[:1].repeat(12, 1)
+    q = q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    data = dc.Measurements.from_sockets(q, ["a"] * 12)
+    found = register_sockets(Geometry.nominal(plain.nominal), data.q, data.device)
+    with pytest.raises(MeasurementError, match="the tool hardly turns"):
+        check_socket_registration(plain.nominal, data, found)
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:

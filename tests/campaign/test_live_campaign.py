@@ -68,18 +68,6 @@ def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign, mea
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
-def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
-    q, y = (part[:18].clone() for part in measured)
-    y[15] += 50 * MM
-    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(20, seed=8), background=True)
-    campaign.add(q, y)
-    campaign.repeat(17)
-    campaign.wait()
-    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
-    assert [one.row for one in campaign.verdicts if not one.accepted] == [15, 17]
-    assert [one.row for one in campaign.verdicts if one.again] == [17]
-
-
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (part[ROWS : ROWS + 1] for part in measured)
     before = measured[0][ROWS - 1]

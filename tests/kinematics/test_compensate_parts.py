@@ -166,6 +166,5 @@ def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
     start = np.array([[0.5, 0.4], [0.1, 0.1], [0.8, 0.8], [0.5, 0.5]])
     q = start + np.array([[0.1, 0.1], [0.1, 0.1], [0.0, 0.0], [-0.1, 0.0]])
     kept = found.within(start, q)
-    np.testing.assert_allclose(kept[0], [0.55, 0.45])
-    np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
+    np.testing.assert_allclose(kept[[0, 1, 3]], [start[0], q[1], q[3]])
     assert np.isnan(kept[2]).all()

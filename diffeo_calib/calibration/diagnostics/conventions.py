@@ -289,9 +289,8 @@ class _Search:
             then = self._unexplained(*tried)
             better = then[3] < share
             pairs = zip((matrix, offset, marker, *now), (*tried, *then), strict=True)
-            matrix, offset, marker, *now = (
-                torch.where(better.view(-1, *[1] * (old.ndim - 1)), new, old) for old, new in pairs
-            )
+            taken = [torch.where(better.view(-1, *[1] * (old.ndim - 1)), new, old) for old, new in pairs]
+            matrix, offset, marker, *now = taken
             damping = torch.where(better, damping / 4, damping * 4).clamp(1e-6, 1e6)
         return starts._replace(matrix=matrix, offset=offset, share=now[3])
 

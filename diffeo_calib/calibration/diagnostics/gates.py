@@ -65,8 +65,6 @@ UNCHOSEN_FACTOR = 9.0
 # three and six numbers.
 MEDIAN_EFFICIENCY = 0.5
 REMAINING_ERROR = 0.2  # largest part of a row's error that may remain with an explanation that is named
-# The same under another label, such as a session; rows that must fit it; payloads up to which each is a label.
-REMAINING_UNDER_LABEL, LABEL_ROWS, MOST_MASSES = 0.3, 2, 10
 # Factor by which an error must exceed what the model's deviations exclude, outside of the rows of its fit.
 OVERCONFIDENT = 3.0
 # Share of wrong rows in a block, fewest of them, and the chance that rows spread at random look like one.
@@ -155,7 +153,8 @@ ROUNDING_LEAST, ROUNDING_MOST = 0.5, 1.5
 
 READING_ROWS = 40  # fewer tell too little: a robot of six joints has some thirty geometric errors
 UNSEEN = 0.05  # motion of a reading, relative to that of a coordinate of the ball, that does not show a joint
-TILTED = 0.05  # motion by turns of the tool, per unit of the ball's offset, below which its place is open
+# Motion by turns of the tool, per unit of the ball's offset, below which its place is open anywhere, or one way.
+TURNED, TILTED = 0.02, 0.05
 SIZE_SHARE = 0.8  # of the expected error from which the robot's size is warned about
 SOCKET_SURPLUS = 6  # rows in sockets beyond the number of these
 SOCKET_FAR = 0.02  # median distance of the ball from its socket that is doubted, as a part of the robot's reach

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
@@ -71,6 +72,14 @@ def worth_it(before: Tensor, after: Tensor) -> bool:
     gain = first - second
     sure = float(gain.mean()) > gates.SURE * float(gain.std()) / len(gain) ** 0.5
     return sure and float(second.mean()) < gates.WORTH**2 * float(first.mean())
+
+
+def warn_of_taken_scales(taken: LeaveOneOut, chosen: LeaveOneOut) -> None:
+    """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
+    if worth_it(taken.errors, chosen.errors):
+        left = float((chosen.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
+        got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
+        warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
 
 
 # --- what may change, from a row on or slowly -------------------------------------------------------------------------

@@ -18,24 +18,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import log
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import (
-    MARKERS,
-    SampledRows,
-    changes_of,
-    left_out_rms,
-    worth_it,
-)
+from diffeo_calib.calibration.diagnostics.hypotheses import MARKERS, SampledRows, changes_of, left_out_rms
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import few, sentence, warn_user
+from diffeo_calib.common.errors import few, sentence
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
@@ -45,7 +38,6 @@ from diffeo_calib.sensors.devices import Hypothesis
 ROUNDS = 20  # of the codes of a mixture
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)  # payloads with a wrong digit, in g, in pounds
 ONE_SET_UP = "one set-up for all rows, in the order of their numbers"
-NOTHING = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
 OPENED_M = 0.01
 """Prior RMS motion by what is opened in a model, more than what is found. Larger motions are gross, such as exchanged
 markers, and left to the weights of the rows."""
@@ -60,8 +52,9 @@ class Candidate(NamedTuple):
     """An explanation that chance does not explain, in words.
 
     Args:
-        left, most: parts of the RMS left-out error that remain with it, and that may remain. columns: (M, U) effects of
-            unknowns of any size that it opens. opens: the rows for which the model then holds; none if it is not to.
+        left, most: parts of the RMS left-out error that remain with it, and that may remain. opens: the rows for which
+            the model holds with its unknowns; none if it shall not have them. columns: (M, U) effects of these, of any
+            size; None where a column of the table is wrong.
     """
 
     what: str
@@ -70,7 +63,7 @@ class Candidate(NamedTuple):
     left: float
     most: float
     opens: str = ""
-    columns: Tensor = NOTHING
+    columns: Tensor | None = None
 
 
 class Finding(NamedTuple):
@@ -78,7 +71,6 @@ class Finding(NamedTuple):
 
     text: str
     columns: Tensor | None  # (N, R, U) effects, m, of unknowns of unit variance that the model shall have
-    of_table: bool  # whether a column of the table is wrong, which explains wrong rows, too
 
 
 def judge(
@@ -88,9 +80,9 @@ def judge(
     lines: Tensor,
     names: Sequence[str],
     *,
-    devices: Iterable[Hypothesis] = (),
-    bodies: Mapping[str, str] = MappingProxyType({}),
-    opens: bool = True,
+    devices: Iterable[Hypothesis],
+    bodies: Mapping[str, str],
+    opens: bool,
 ) -> Finding | None:
     """The explanation with which left-out errors fall most, relative to what may remain; None without any.
 
@@ -122,11 +114,11 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
     moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
     fix, columns = best.fix, None
     got = f"about {1e3 * moved:.2g} mm of error; leave-one-out errors fall to {100 * best.left:.0f} % beside it"
-    if best.opens and moved < OPENED_M:
+    if best.opens and best.columns is not None and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns, best.columns is NOTHING)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -343,9 +335,8 @@ def other_payloads(
     own, without = codes[""], rows._replace(process=under(codes[""], 0.0))
     shuffled = torch.randperm(len(own), generator=seeded(0), device=HOST).to(E.device)
     right, chance = (Mixture(without, each, kinds.expand(len(own), -1)) for each in (E, E[shuffled]))
-    (chosen, gain), (_, by_chance) = (
-        _likeliest_codes(each, own, sag.own[sag.loaded].to(E)) for each in (right, chance)
-    )
+    axes = sag.own[sag.loaded].to(E)
+    (chosen, gain), (_, by_chance) = (_likeliest_codes(each, own, axes) for each in (right, chance))
     if gain - by_chance >= gates.PAYLOAD_ODDS:
         what = f"{int((chosen != own).sum())} of {len(own)} rows seem to have carried payloads of other rows, such as "
         what += f"lines {few(lines[rows.index][chosen != own].tolist(), 5)}"
@@ -372,11 +363,3 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
         which = {"are": masses == mass, "are at least": masses >= mass, "are at most": masses <= mass}
         for (words, some), factor in product(which.items(), MISTYPED):
             yield f"{factor:.4g} times as large where they {words} {mass:g}", torch.where(some, factor * masses, masses)
-
-
-def warn_of_taken_scales(taken: LeaveOneOut, chosen: LeaveOneOut) -> None:
-    """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
-    if worth_it(taken.errors, chosen.errors):
-        left = float((chosen.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
-        got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
-        warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))

@@ -137,13 +137,12 @@ def outliers(
         outlying += [replace(outlier, row=int(rows[outlier.row])) for outlier in suspects]
     for kind in placed.readings:
         data, sizes = kind.data, each[kind.rows, 0].nan_to_num(0.0).norm(dim=1).tolist()
-        shown, balls = errors_of_kinds(left_out.errors, None, [kind]).main, model.at_payloads(data.payload)(data.q)
+        shown = errors_of_kinds(left_out.errors, None, [kind]).main
         unit, per_unit = shown.shown
         for k in bad[kind.rows, 0].nonzero()[:, 0].tolist():
             row, reading = int(kind.rows[k]), (per_unit * float(shown.errors[k, 0]), unit)
             of_row = row, None, int(data.line_numbers[k]), data.row_names[k], sizes[k], float(weights[row, 0])
-            reason = kind.reason(balls[k, -1].detach(), gates.REMAINING_ERROR * sizes[k])
-            outlying.append(Outlier(*of_row, reason, reading=reading))
+            outlying.append(Outlier(*of_row, FAR, reading=reading))
     return sorted(outlying, key=lambda outlier: -outlier.distance)
 
 
@@ -242,6 +241,7 @@ def warn_of_outliers(outlying: Sequence[Outlier], data: Any) -> None:
     parts += [(words, rows) for words, rows, _ in _device_rows(data)]
     many = [(words, rows) for words, rows in parts if float(flags[rows].double().mean()) > gates.GROSS_SHARE]
     if many:
+        many = many[:1] if many[0][0] == "rows" else many
         counts = few([f"{int(flags[rows].sum())} of {len(rows)} {words}" for words, rows in many], MOST_NAMES)
         fix = "do not rely on these rows: check that they pair joints with their own points, that markers keep their "
         fix += "numbers, the columns and units; of a set-up, whether more has moved than was said: leave it out, and "
@@ -445,12 +445,10 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: Tensor) -
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
     size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
-    what = (
-        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}"
-    )
+    count, where = int(flags[start:end].sum()), f"lines {lines[0]} to {lines[-1]}{last}"
     got = f"a median error of {1e3 * size:.3g} mm; {', '.join(motions(model, block)) or 'for no common reason'}"
     fix = "check what happened there; calibrate without these lines, or measure them again"
-    return sentence(what, got=got, fix=fix)
+    return sentence(f"{count} rows look wrong that follow one another: {where}", got=got, fix=fix)
 
 
 def common_cause(

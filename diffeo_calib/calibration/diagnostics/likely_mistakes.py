@@ -33,15 +33,7 @@ from diffeo_calib.calibration.identification.registration import (
     spread,
 )
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import (
-    LONGEST_NAME,
-    DiffeoCalibError,
-    InputError,
-    MeasurementError,
-    sentence,
-    shown,
-    warn_user,
-)
+from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, MeasurementError, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES
 from diffeo_calib.measurements.csv.columns import Columns
@@ -59,10 +51,6 @@ GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
 """Distance, in medians, beyond which the rows that are the farthest off may spoil a registration: it is repeated with
 the share of rows that are closest, at most so often."""
 MOST_COLUMNS = 4  # most that are tried in the place of another one: every try is a registration
-NO_MISTAKE_FOUND = (
-    "check the angle unit, the order of the joints, the tip link or DH convention, "
-    "and that rows pair joints with their own points"
-)
 
 
 class Reading(NamedTuple):
@@ -247,7 +235,7 @@ def longer_chains(as_read: Reading, data: Measurements) -> Iterator[Reading]:
     for joint, child in moving_joints_below(content, robot.tips):
         try:
             longer = read_urdf(content, robot.base, child, Path("URDF"))
-        except InputError:
+        except DiffeoCalibError:
             continue  # a joint that cannot be part of a chain
         added = [name for name in longer.joint_names if name not in robot.joint_names]
         if longer.joint_names[: robot.n] != robot.joint_names or not {joint, *added} <= {*spare}:

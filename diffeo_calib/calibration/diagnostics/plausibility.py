@@ -16,16 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.likely_mistakes import (
-    NO_MISTAKE_FOUND,
-    Reading,
-    check_fit,
-    check_row_order,
-    other_conventions,
-    other_units,
-    residual_of,
-)
+from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     SocketRegistration,
@@ -61,11 +52,8 @@ def check_joints(robot: Tree, data: Any) -> None:
         what, fix = f"the measurements do not fit robot '{robot.name}'", "check the base and tip links, and the "
         raise MeasurementError.of(what, expected=f"{robot.n} joints ({ours})", got=data.n, fix=fix + "joint columns")
     if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
-        what, fix = (
-            f"the measurements' joints are not those of robot '{robot.name}'",
-            joint_name_fix(robot, data.joint_names),
-        )
-        raise RobotError.of(what, expected=ours, got=few(data.joint_names, MOST_NAMES), fix=fix)
+        what, got = f"the measurements' joints are not those of robot '{robot.name}'", few(data.joint_names, MOST_NAMES)
+        raise RobotError.of(what, expected=ours, got=got, fix=joint_name_fix(robot, data.joint_names))
     if len(data) == 1:
         return  # the registration refuses a single row
     low, high = robot.limits.to(data.q.device).unbind(1)
@@ -85,7 +73,7 @@ def check_joints(robot: Tree, data: Any) -> None:
 def check_limits(robot: Tree, data: Any) -> None:
     """Warn of joints far beyond the robot's limits, but for whole turns.
 
-    Reading the data warns of joints that span several turns.
+    likely_mistakes.Reading the data warns of joints that span several turns.
     """
     low, high = robot.limits.to(data.q.device).unbind(1)
     turns = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
@@ -94,15 +82,12 @@ def check_limits(robot: Tree, data: Any) -> None:
     least, most, margin = q.amin(0), q.amax(0), gates.LIMIT_EXCESS * (high - low)
     beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
     beyond = beyond & ~(turns & (data.q.abs().amax(0) > LARGEST_JOINT_ANGLE_RAD))
-    for kind, unit, other in ((turns, "rad", "degrees"), (~turns, "m", "millimetres")):
-        where = (beyond & kind).nonzero()[:, 0].tolist()
-        if where:
-            which = few([robot.joint_names[joint] for joint in where], MOST_NAMES)
-            limits, got = (
-                f"{float(a[where[0]]):.3g} to {float(b[where[0]]):.3g} {unit}" for a, b in ((low, high), (least, most))
-            )
-            fix = f"check the joint's offset, sign and unit (not in {other}?)"
-            warn_user(sentence(f"{which}: far beyond the robot's limits", expected=limits, got=got, fix=fix))
+    if where := beyond.nonzero()[:, 0].tolist():
+        which, first = few([robot.joint_names[joint] for joint in where], MOST_NAMES), where[0]
+        unit, other = ("rad", "degrees") if robot.periodic[first] else ("m", "millimetres")
+        ranges = [f"{float(a[first]):.3g} to {float(b[first]):.3g} {unit}" for a, b in ((low, high), (least, most))]
+        fix = f"check the joint's offset, sign and unit (not in {other}?)"
+        warn_user(sentence(f"{which}: far beyond the robot's limits", expected=ranges[0], got=ranges[1], fix=fix))
 
 
 def quantum(values: Tensor, *, turning: bool) -> tuple[float, str] | None:
@@ -112,9 +97,8 @@ def quantum(values: Tensor, *, turning: bool) -> tuple[float, str] | None:
     """
     units = (("rad", 1.0), ("degrees", math.pi / 180)) if turning else (("m", 1.0), ("mm", 1e-3))
     steps = [step for k in range(gates.DIGITS + 1) for step in (10.0**-k, 5 * 10.0 ** -(k + 1))]
-    for size, words in sorted(
-        ((step * size, f"{step:g} {unit}") for unit, size in units for step in steps), reverse=True
-    ):
+    named = [(step * size, f"{step:g} {unit}") for unit, size in units for step in steps]
+    for size, words in sorted(named, reverse=True):
         multiples = values / size
         several = len(multiples.round().unique()) >= gates.DIGIT_VALUES  # else near the same multiple of a large step
         if several and float((multiples - multiples.round()).abs().max()) < gates.DIGIT_REMAINDER:
@@ -160,7 +144,7 @@ def registered(robot: Tree, data: Measurements) -> Identification:
     check_markers(robot, data)
     registration, inliers = register_inliers(robot, data)
     _check_motion(robot, data)
-    check_row_order(robot, data, registration)
+    likely_mistakes.check_row_order(robot, data, registration)
     registration = with_large_offsets(data, registration, inliers)
     _check_registration(robot, data, registration)
     return registration
@@ -192,7 +176,7 @@ def _check_registration(robot: Tree, data: Measurements, registration: Identific
         what = "the measurements do not fit this robot: no base frame and markers explain them"
         expected = f"residuals well below the points' spread of {measured:.3g} m"
         said = {"what": what, "expected": expected, "got": f"a median of {typical:.3g} m"}
-        check_fit(robot, data, typical, said)
+        likely_mistakes.check_fit(robot, data, typical, said)
 
 
 def check_identification(data: Measurements, identification: Identification) -> None:
@@ -220,8 +204,10 @@ def check_identification(data: Measurements, identification: Identification) -> 
         what, got = "measured orientations", f"a median of {math.degrees(float(angles.median())):.3g} degrees"
         expected = f"errors well below {math.degrees(gates.ORIENTATION_RAD):.0f} degrees"
     what = f"the {what} do not fit this robot, even with geometric errors"
-    otherwise = NO_MISTAKE_FOUND * (turned or typical >= gates.UNEXPLAINED_RESIDUAL * size)
-    check_fit(geometry.chain, data, typical, {"what": what, "expected": expected, "got": got}, otherwise)
+    advice = "check the angle unit, the order of the joints, the tip link or DH convention, and that rows pair joints "
+    advice = f"{advice}with their own points" * (turned or typical >= gates.UNEXPLAINED_RESIDUAL * size)
+    said = {"what": what, "expected": expected, "got": got}
+    likely_mistakes.check_fit(geometry.chain, data, typical, said, advice)
 
 
 def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identification, fit: Identification) -> None:
@@ -300,7 +286,7 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[tuple[int, s
     for k, visible in enumerate(data.seen_bodies.unbind(1)):
         if int(visible.sum()) >= gates.STUCK_ROWS:
             alone = Measurements.of_points(data.q[visible], data.origins[visible][:, [k]], (tips[k],), None)
-            medians[k] = residual_of(robot, alone)
+            medians[k] = likely_mistakes.residual_of(robot, alone)
     for k, typical in enumerate(medians):
         far = max(other for other, tip in zip(medians, tips, strict=True) if tip == tips[k])
         explained = gates.DIGITS_SHARE * size < far < gates.RIGHT_READING * size
@@ -353,7 +339,7 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
 def check_socket_registration(
     robot: Tree, data: SocketReadings, fit: SocketRegistration, beside: tuple[Geometry, Measurements] | None = None
 ) -> None:
-    """Refuse rows that fit with one mistake undone, and known distances that are the robot's in another unit.
+    """Refuse rows that fit with one mistake undone, a tool that never turns, and distances in another unit.
 
     Warns:
         DiffeoCalibWarning: a ball in no socket, or not that of the robot that a device saw; a known distance that is
@@ -362,18 +348,22 @@ def check_socket_registration(
     Args:
         robot: n joints. data: the rows. fit: their registration. beside: the robot as a device saw it, and its rows.
     """
-    median, socket, around = float(fit.distances.median()), data.device, robot if beside is None else beside[0]
+    median, socket, around = (
+        float(fit.distances.median()),
+        data.device,
+        beside[0] if beside else Geometry.nominal(robot),
+    )
     far, usual = median > gates.SOCKET_FAR * robot.reach, inf
     if beside is not None and len(known(beside[1].points)) >= gates.OVERDETERMINED * (6 + 3 * beside[1].markers):
         usual = float(distances(*beside).nanmedian())  # fewer positions are fitted nearly exactly
 
-    def left(reading: Reading) -> tuple[float, float]:
+    def left(reading: likely_mistakes.Reading) -> tuple[float, float]:
         again = register_sockets(around, reading.q, socket)
         return float(again.distances.median()), max(spread(robot.tip_poses(reading.q)[..., :3, 3]), 1e-9)
 
-    motion, tried = left(Reading.of(robot, data))[1], [partial(other_units, slides=far)]
+    motion, tried = left(likely_mistakes.Reading.of(robot, data))[1], [partial(likely_mistakes.other_units, slides=far)]
     if far and beside is None:
-        tried.append(partial(other_conventions, judge=left))
+        tried.append(partial(likely_mistakes.other_conventions, judge=left))
     what = "these rows do not fit the robot" + ": the ball is in no socket" * far
     expected = f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves"
     if median > max(gates.OTHER_ROBOT_RESIDUALS * usual, gates.OTHER_ROBOT_SHARE * robot.reach):
@@ -382,7 +372,10 @@ def check_socket_registration(
     fix = "check that all rows are of one robot, the unit and the order of the joints, and that rows carry the names "
     fix += "of their own sockets: of the place and of the socket in it"
     said = {"what": what, "expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
-    check_fit(robot, data, median, said, fix * far, groups=tried, judge=left)
+    likely_mistakes.check_fit(robot, data, median, said, fix * far, groups=tried, judge=left)
+    if fit.turning < gates.TURNED:
+        what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
+        raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
     for first, second, length in data.lengths:
         apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (socket == first) | (socket == second)

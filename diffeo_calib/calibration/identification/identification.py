@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan, sqrt
+from math import inf, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import seeded
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
@@ -82,10 +82,7 @@ class Identification:
     # or is Gaussian
     weights: tuple[Tensor, ...]
     freedom: float = inf  # of Student's t
-    shifts: tuple[Tensor, ...] = ()  # (c,) what the rows of every kind share
     devices: tuple[Devices, ...] = ()  # those of readings, in the order of their tables
-    # root mean square distance of the measured bodies, each predicted by the others to first order [m]
-    left_out: float = nan
 
     @property
     def deviations(self) -> Tensor:
@@ -96,11 +93,6 @@ class Identification:
     def tails(self) -> Tails:
         """Tails of the first kind of rows, such as those that tell coordinates."""
         return Tails(self.freedom, self.weights[0])
-
-
-def with_ball(geometry: Geometry, ball: Geometry) -> Geometry:
-    """Add the marker of another geometry of the same robot, a ball."""
-    return geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
 
 
 def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
@@ -119,71 +111,54 @@ def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, .
     return tuple(sorted(held))
 
 
-class MeasuredPoints(NamedTuple):
-    """Measured markers (N, P, 3), m, NaN where hidden, the first of a geometry."""
+class KindRows(NamedTuple):
+    """Rows of one kind: measured markers, the first of a geometry, or readings of its last points."""
 
-    q: Tensor
-    points: Tensor
+    q: Tensor  # (N, n)
+    y: Tensor  # (N, B, d) numbers of B bodies, m, NaN where hidden
+    around: Devices | None = None  # of readings: those around which their places are sought
+    device: Tensor = torch.zeros(0, dtype=torch.int64, device=HOST)  # (N,) numbers of these
 
     @classmethod
-    def of(cls, q: Tensor, points: Tensor) -> MeasuredPoints:
-        """On the CPU."""
+    def positions(cls, q: Tensor, points: Tensor) -> KindRows:
+        """Measured markers (N, P, 3), m."""
         return cls(q.detach().cpu(), points.detach().cpu())
+
+    @classmethod
+    def read(cls, data: Readings, around: Devices) -> KindRows:
+        return cls(data.q, around.values(data)[:, None], around, around.numbers(data))
 
     @property
     def freedom(self) -> int:
-        """Number c of shifts of unit variance: none."""
-        return 0
+        """Number c of shifts of unit variance, those of devices."""
+        return 0 if self.around is None else self.around.freedom
+
+    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
+        """The devices after shifts (c,)."""
+        return () if self.around is None else (self.around.shifted(shifts),)
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        """Predicted minus measured numbers (N, B, d) of B bodies, m, for points (N, P', 3) and shifts (c,)."""
-        return points[:, : self.points.shape[1]] - self.points
+        """Predicted minus measured numbers (N, B, d), m, for points (N, P', 3) and shifts (c,)."""
+        for devices in self.devices(shifts):
+            return devices.observation(self.device).value(devices.points_of(points))[:, None] - self.y
+        return points[:, : self.y.shape[1]] - self.y
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
         """Their derivatives (N, B, d, f + c) by f errors that move points by (N, P', 3, f), then by the shifts."""
-        return by_errors[:, : self.points.shape[1]]
+        for devices in self.devices(shifts):
+            places = devices.points_of(points)
+            by_points = devices.observation(self.device).slope(places)
+            slopes = by_points @ by_errors[:, -devices.seen_points :].flatten(1, 2)
+            return torch.cat([slopes, devices.shared(places, self.device)], 2)[:, None]
+        return by_errors[:, : self.y.shape[1]]
 
-    def sample(self) -> MeasuredPoints:
-        """Random rows that stand for all of them, if there are many."""
-        count = max(1, COORDINATES // self.points[0].numel())
-        if len(self.q) <= count:
+    def sample(self) -> KindRows:
+        """Random rows that stand for all of them, if there are many markers."""
+        count = max(1, COORDINATES // self.y[0].numel())
+        if self.around is not None or len(self.q) <= count:
             return self
         index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
-        return MeasuredPoints(*(tensor[index] for tensor in self))
-
-    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
-        """The devices of readings after shifts (c,)."""
-        return ()
-
-
-class ReadRows(NamedTuple):
-    """Readings of one kind of the last points, such as a ball, and devices around which their places are sought."""
-
-    data: Readings
-    around: Devices
-
-    @property
-    def q(self) -> Tensor:
-        return self.data.q
-
-    @property
-    def freedom(self) -> int:
-        return self.around.freedom
-
-    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
-        return (self.around.shifted(shifts),)
-
-    def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        return -self.devices(shifts)[0].errors(self.data, self.around.points_of(points))[:, None]
-
-    def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        (devices,), places = self.devices(shifts), self.around.points_of(points)
-        device = devices.numbers(self.data)
-        slopes = devices.observation(device).slope(places) @ by_errors[:, -devices.seen_points :].flatten(1, 2)
-        return torch.cat([slopes, devices.shared(places, device)], 2)[:, None]
-
-    def sample(self) -> ReadRows:
-        return self
+        return KindRows(self.q[index], self.y[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +166,7 @@ class Rows:
     """Rows of several kinds, and the geometry that explains them."""
 
     geometry: Geometry  # the start
-    parts: tuple[MeasuredPoints | ReadRows, ...]  # the rows of every kind
+    parts: tuple[KindRows, ...]  # the rows of every kind
 
     @property
     def freedom(self) -> list[int]:
@@ -225,7 +200,6 @@ class Rows:
             prior=prior,
             weights=tuple(_as_bodies(tails.weights, errors)),
             freedom=tails.freedom,
-            shifts=shifts,
             devices=tuple(each for part, some in zip(self.parts, shifts, strict=True) for each in part.devices(some)),
         )
 
@@ -258,16 +232,13 @@ def identify(
 ) -> Identification:
     """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
 
-    Without ``noise``, it is estimated, see :func:`estimated`.
-
     Args:
-        geometry: the start, and the centre of the prior.
-        q: (N, n) joint values [rad or m].
+        geometry: the start, and the centre of the prior. q: (N, n) joint values [rad or m].
         points: (N, P, 3) measured markers [m]; NaN where they are hidden.
-        noise: standard deviation of one coordinate [m].
+        noise: standard deviation of one coordinate [m]; by default it is estimated, see :func:`estimated`.
         prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
     """
-    rows, held = Rows(geometry, (MeasuredPoints.of(q, points),)), held_parameters(geometry)
+    rows, held = Rows(geometry, (KindRows.positions(q, points),)), held_parameters(geometry)
     if noise is None:
         return estimated(rows, held, prior)
     used, sigma = prior or Prior(), points.new_full((points[..., 0].numel(),), noise)
@@ -311,12 +282,11 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
-    left_out = squares / (1.0 - fit.leverage / dim).square()
     if any(part is not whole for part, whole in zip(some.parts, rows.parts, strict=True)):
         errors = rows.errors(*at)
         (dim, kind) = sizes_and_kinds(errors)
         tails = reweight(body_squares(errors) / levels[kind].square(), dim)
-    return replace(rows.found(fit, noise, used, tails), left_out=float(left_out.nanmean().sqrt()))
+    return rows.found(fit, noise, used, tails)
 
 
 def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
@@ -330,18 +300,13 @@ def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
 
 
 class Fit(NamedTuple):
-    """One least-squares fit.
+    """One least-squares fit."""
 
-    Args:
-        theta: (K,) errors. covariance: (K, K). shifts: of all parts.
-        errors: (N, B, d) of every part, m. leverage: (M,) of all bodies.
-    """
-
-    theta: Tensor
-    covariance: Tensor
-    shifts: Tensor
-    errors: list[Tensor]
-    leverage: Tensor
+    theta: Tensor  # (K,) errors
+    covariance: Tensor  # (K, K)
+    shifts: Tensor  # (c,) of all parts
+    errors: list[Tensor]  # (N, B, d) of every part, m
+    leverage: Tensor  # (M,) of all bodies
 
 
 def solve(

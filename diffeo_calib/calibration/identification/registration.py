@@ -1,18 +1,15 @@
 """Find base and markers of a robot from measured points, or ball and sockets from joint values, without a start value.
 
-The base and the markers: :mod:`diffeo_calib.robots.placement`. Ball and sockets are found in closed form. In all rows
-of socket s the ball c, carried by the tip's poses (R_i, t_i), is at one point, so that
+Base and markers: :mod:`diffeo_calib.robots.placement`, of the rows that are no gross outliers. In all rows of socket s
+the ball c, carried by the tip's poses (R_i, t_i), is at one point, so that
 
     (R_i - mean_s R) c + (t_i - mean_s t) = 0,    p_s = mean_s (R_i c + t_i),
 
-linear in the ball c and then in the sockets p_s. Rows are weighed by their distance in units of the median, so that
-rows in a wrong socket lose their influence.
+linear in the ball c and then in the sockets p_s. Rows are weighed by their distance in units of the median.
 
-Registration that survives gross outliers, and joint offsets that are far from the robot's description.
-
-Such offsets are tens of degrees, where geometric errors are milliradians: an encoder was mounted at another angle, a
-homing switch was moved, or the robot was not mastered. The prior of a geometric calibration excludes them. They are
-therefore estimated before it, together with base and markers, as one constant per joint, by robust least squares.
+Joint offsets of tens of degrees (an encoder mounted at another angle, a homing switch moved, a robot not mastered) are
+excluded by the prior of a geometric calibration, whose errors are milliradians: they are found before it, with base and
+markers, by robust least squares.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import (
     PRECISE,
     Identification,
-    MeasuredPoints,
+    KindRows,
     Rows,
     described,
     identify,
@@ -51,13 +48,9 @@ from diffeo_calib.sensors.devices import median_weights
 def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Identification:
     """Find the base and the markers of a robot in the frame of the measuring device, joint errors untouched.
 
-    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) their tip's poses, with a
-    prior that keeps undetermined markers near the tip. No start is needed, see :mod:`diffeo_calib.robots.placement`.
-
     Args:
         robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
-        q: (N, n) joint values [rad or m].
-        points: (N, P, 3) measured markers [m]; NaN where they are hidden.
+        q: (N, n) joint values [rad or m]. points: (N, P, 3) measured markers [m]; NaN where they are hidden.
         on: names of their tips, P of them; the robot's first tip by default.
 
     Raises:
@@ -67,7 +60,7 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
     q, points = q.detach().cpu(), points.detach().cpu()
     squares = (geometry.points(q) - points)[seen_markers(points)].square()
     noise = sqrt(float(squares.sum()) / max(squares.numel() - 6 - 3 * points.shape[1], 1))
-    return described(Rows(geometry, (MeasuredPoints.of(q, points),)), [noise])
+    return described(Rows(geometry, (KindRows.positions(q, points),)), [noise])
 
 
 def registered_geometry(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Geometry:
@@ -117,16 +110,17 @@ class SocketRegistration(NamedTuple):
     geometry: Geometry  # with the ball as its marker; where the base is not known, it is the measuring frame
     positions: Tensor  # (S, 3) the sockets in the measuring frame, m
     distances: Tensor  # (N,) from the ball to its socket, m
+    turning: float  # largest RMS motion of the ball's place by turns of the tool in the sockets, per unit of its offset
 
 
-def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
+def register_sockets(bare: Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
     """Find ball and sockets, joint errors untouched.
 
     Args:
-        robot: n joints, with one tip; or a geometry, whose base and joint errors are kept: places are then in its
-            measuring frame. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
+        bare: whose base and joint errors are kept: places are in its measuring frame. The ball is on the tip of the
+            first marker. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
     """
-    bare = robot.with_tool(robot.tool[:1], robot.on[:1]) if isinstance(robot, Geometry) else Geometry.nominal(robot, 1)
+    bare = bare.with_tool(bare.tool[:1], bare.on[:1])
     poses = bare.marker_poses(q)[:, 0]
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     weights = torch.ones_like(t[:, 0])
@@ -141,7 +135,9 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
             break
-    return SocketRegistration(bare.with_tool(ball[None]), _means(R @ ball + t, socket, weights), distances)
+    return SocketRegistration(
+        bare.with_tool(ball[None]), _means(R @ ball + t, socket, weights), distances, float(s[0]) / len(A) ** 0.5
+    )
 
 
 def socket_means(points: Tensor, socket: Tensor) -> Tensor:
@@ -189,7 +185,7 @@ def find_joint_offsets(
     twists, parts = offset_twists(geometry), geometry.slices
     places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
-    rows = Rows(geometry, (MeasuredPoints.of(q, points),))
+    rows = Rows(geometry, (KindRows.positions(q, points),))
     fit = solve(rows, points.new_full((points[..., 0].numel(),), noise), root, **options)
     return (twists.mT @ fit.theta) / twists.square().sum(0)
 
@@ -218,9 +214,9 @@ CONSISTENT = 0.02
 """Residual, a median distance relative to the spread of the markers, with which rows need no draws."""
 EXAMINED, ACCEPTED, REMAINING = 0.01, 0.02, 0.3
 """Such residuals from which joint offsets are estimated and that may remain with them, and which part may remain."""
-LARGEST_OFFSET_RAD, LEFT_OUT = 0.8, 1.1
-"""Largest offset of a turning joint that is accepted, and the largest error of left-out points after a geometric
-calibration, in that of one without these offsets."""
+LARGEST_OFFSET_RAD, WORSE = 0.8, 1.1
+"""Largest offset of a turning joint that is accepted, and largest noise of a geometric calibration with offsets in that
+of one without."""
 REPORTED = 0.2
 """Smallest offset that is reported, as a part of the largest."""
 
@@ -275,48 +271,41 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     if not explained or bool((turned.abs() > LARGEST_OFFSET_RAD).any()):
         return registration
     plain, other = (identify(start, data.q[inliers], data.points[inliers]) for start in (geometry, again.geometry))
-    if other.left_out > LEFT_OUT * plain.left_out:
+    if other.noise > WORSE * plain.noise:
         return registration
-    smallest = REPORTED * float(offsets.abs().max())
     named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
-    large = ", ".join(
+    each = [
         f"{name} by {math.degrees(offset):.1f} degrees" if turns else f"{name} by {1e3 * offset:.1f} mm"
         for name, offset, turns in named
-        if abs(offset) >= smallest
-    )
-    text = sentence(
-        f"joint offsets are far from the robot's description: {large}",
-        got=f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints",
-        fix="the calibration starts from these offsets; check those in the description, and the order of the joints",
-    )
-    warn_user(text)
+        if abs(offset) >= REPORTED * float(offsets.abs().max())
+    ]
+    what = f"joint offsets are far from the robot's description: {', '.join(each)}"
+    got = f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints"
+    fix = "the calibration starts from these offsets; check those in the description, and the order of the joints"
+    warn_user(sentence(what, got=got, fix=fix))
     return again
 
 
 def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
     """Rows (N,) boolean that are near the best of a few registrations, of all rows and of random subsets.
 
-    With the inliers every marker is seen.
-
     A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
-    of them.
+    of them. With the inliers every marker is seen.
     """
-    start = largest_distances(registered_geometry(robot, data.q, data.points, on), data)
-    every = torch.ones_like(start, dtype=torch.bool)
-    gross = GROSS_DISTANCES
+
+    def away(rows: Any) -> Tensor:
+        return largest_distances(registered_geometry(robot, data.q[rows], data.points[rows], on), data)
+
+    start = best = away(slice(None))
+    every, gross = torch.ones_like(start, dtype=torch.bool), GROSS_DISTANCES
     if float(start.max()) <= gross * float(start.median()) <= gross * CONSISTENT * spread(data.points):
         return every
-    best = start
-    generator = seeded(0)
-    share = data.visible.double().mean()
-    drawn = SURPLUS * math.ceil((2.0 / data.markers + 1.0) / float(share))  # 6 + 3 P unknowns, 3 P coordinates
+    share, generator = float(data.visible.double().mean()), seeded(0)
+    drawn = SURPLUS * math.ceil((2.0 / data.markers + 1.0) / share)  # 6 + 3 P unknowns, 3 P coordinates
     for _ in range(DRAWS if len(data) > 2 * drawn else 0):
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
-        if not can_register(data.points[rows]):
-            continue
-        largest = largest_distances(registered_geometry(robot, data.q[rows], data.points[rows], on), data)
-        best = largest if float(largest.median()) < float(best.median()) else best
+        if can_register(data.points[rows]):
+            best = min(best, away(rows), key=lambda each: float(each.median()))
     near = best <= gross * float(best.median())
-    if float(best.median()) > 0.5 * float(start.median()) or not can_register(data.points[near]):
-        return every
-    return near
+    better = float(best.median()) <= 0.5 * float(start.median())
+    return near if better and can_register(data.points[near]) else every

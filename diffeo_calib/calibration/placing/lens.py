@@ -84,44 +84,44 @@ class LensAndBoard(CameraErrors):
             data: in the frame of one session. rows: (M,) numbers in the whole table. registration: of all of them.
             sessions: of these rows, whose places were found with lengths that may be wrong.
 
-        Raises:
-            MeasurementError: a board of another size than was said.
+        Warns:
+            DiffeoCalibWarning: a board of another size than was said.
         """
         sets: list[Any] = []
         for shared in data.shared_errors():
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
             cameras, on_tool = dict[str, BoardCamera](), data.board is not None
             for number, (name, camera) in enumerate(shared.cameras.items()):
-                mask = shared.seen_by == number
-                nominal = registration.rms if len(shared.cameras) == 1 else float(away[mask].square().mean().sqrt())
-                explained = Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number))
-                cameras[name] = BoardCamera(camera, on_tool, explained)
-            free = _places(data, rows, registration, sessions)
-            apart, places = shared.slopes.flatten(0, 1), free.flatten(0, 1)
-            apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
-            larger = _relative_size(data, registration, free)
-            rest = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
-            sets.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *rest))
+                nominal = _rms(away[shared.seen_by == number])
+                cameras[name] = BoardCamera(camera, on_tool, Explained(nominal, *[0.0] * 4, _corners(shared, number)))
+            places = _places(data, rows, registration, sessions)
+            larger, free = _relative_size(data, registration, places), places.flatten(0, 1)
+            effects = shared.slopes.flatten(0, 1)
+            apart = effects - free @ torch.linalg.lstsq(free, effects, driver="gelsd").solution
+            devices = BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras)
+            sets.append(cls(devices, shared, data.bodies.pose_lever(), apart.view_as(shared.slopes), larger))
             if abs(larger) >= SIZE_WARNED:
-                what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
                 fix = (
                     "measure the printed squares with a caliper (printers scale to fit the page), and check their unit"
                 )
-                warn_user(sentence(f"{what}: {got}", fix=fix))
+                warn_user(sentence("the size of the board does not fit that of the robot", got=got, fix=fix))
         return sets
 
     def settled(self, fit: Settled) -> LensAndBoard:
         spread, cameras = torch.linalg.cholesky(fit.covariance), dict[str, BoardCamera]()
         for number, (name, device) in enumerate(self.devices.cameras.items()):
             camera = self.shared.cameras[name]
-            change, root = camera.root @ fit.shifts, camera.root @ spread
+            change, root = camera.root @ fit.shifts[:, None], camera.root @ spread
             effects = self.apart[self.shared.seen_by == number] @ torch.linalg.pinv(camera.root)
-            lens, board = (_at_tool(effects, change, part) for part in PARTS)
-            lens_std, board_std = (_at_tool(effects, root, part) for part in PARTS)
-            errors = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
-            camera = replace(camera, unknowns=camera.unknowns + change, root=root)
-            cameras[name] = BoardCamera(camera, device.on_tool, replace(device.explained, **errors))
+            lens, board, lens_std, board_std = (
+                _rms((effects[..., part] @ errors[part]).unflatten(1, (-1, 3)).square().sum((2, 3)).sqrt())
+                for errors in (change, root)
+                for part in PARTS
+            )
+            camera = replace(camera, unknowns=camera.unknowns + change[:, 0], root=root)
+            explained = Explained(device.explained.nominal, lens, board, lens_std, board_std, device.explained.corners)
+            cameras[name] = BoardCamera(camera, device.on_tool, explained)
         shared = self.shared._replace(cameras={name: device.camera for name, device in cameras.items()})
         return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
@@ -195,16 +195,12 @@ class LensAndBoard(CameraErrors):
 
 def _corners(shared: SharedErrors, number: int) -> float:
     """RMS distance at the tool by the noise of one image of a camera, m."""
-    return _rms_distance(shared.noise[shared.seen_by == number].diagonal(dim1=1, dim2=2).sqrt())
+    variances = shared.noise[shared.seen_by == number].diagonal(dim1=1, dim2=2)
+    return _rms(variances.unflatten(1, (-1, 3)).sum(2).sqrt())
 
 
-def _at_tool(effects: Tensor, errors: Tensor, part: slice) -> float:
-    """RMS distance, m, of points (M, 9) by some errors of lens and board, summed in squares.
-
-    Args:
-        effects: (M, 9, 14) of the unknowns of a camera, m. errors: (14,) or (14, c) of these.
-    """
-    return _rms_distance((effects[..., part] @ errors[part]).view(*effects.shape[:2], -1).norm(dim=2))
+def _rms(distances: Tensor) -> float:
+    return float(distances.square().mean().sqrt())
 
 
 def _relative_size(data: Measurements, registration: Identification, places: Tensor) -> float:
@@ -232,8 +228,3 @@ def _places(data: Measurements, rows: Tensor, registration: Identification, sess
     at = data.points, tool, data.points.mean((0, 1))
     steps = [part.increments(*at, part.by_row(int(rows.max()) + 1)[rows], whole) for part in sessions]
     return torch.cat([base, tool, *steps], 2)
-
-
-def _rms_distance(coordinates: Tensor) -> float:
-    """RMS distance of points by RMS errors (M, 9) of their coordinates, m."""
-    return float((3 * coordinates.square().mean()).sqrt())

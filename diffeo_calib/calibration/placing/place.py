@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import variation
-from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.plausibility import (
@@ -30,19 +28,17 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
 )
 from diffeo_calib.calibration.identification.identification import (
     Identification,
-    MeasuredPoints,
+    KindRows,
     Prior,
-    ReadRows,
     Rows,
     described,
     estimated,
     held_parameters,
     identify,
-    with_ball,
 )
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
+from diffeo_calib.calibration.placing.placement import Elsewhere, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     ball_of,
@@ -53,7 +49,7 @@ from diffeo_calib.calibration.placing.readings import (
 from diffeo_calib.calibration.placing.sessions import Drift, Sessions
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import few, sentence, warn_user
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -213,31 +209,6 @@ class Placed:
         shared = [self.placement.shared(data)] if opened is None else [opened, self.placement.shared(data)]
         return replace(data, shared=torch.cat(shared, 2), held=held, adrift=self.free)
 
-    def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
-        """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
-        aligned = self.coordinates
-        if aligned is None or not wrong:
-            return None
-        table, flags = aligned.table, torch.zeros(len(self.data), dtype=torch.bool, device=aligned.rows.device)
-        flags[[outlier.row for outlier in wrong]] = True
-        predicted, flags = model.at_payloads(table.payload)(table.q).detach(), flags[aligned.rows]
-        labels = [label for part in self.placement for label in part.labels(aligned, predicted)]
-        masses = table.masses.unique().tolist()
-        for mass in masses if len(masses) <= gates.MOST_MASSES else ():
-            away = model.with_payload(mass)(table.q).detach() - table.points
-            labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
-        errors = (predicted - table.points).norm(dim=-1).nanmean(1)
-        fit = [(flags & case.applies & (case.errors < gates.REMAINING_UNDER_LABEL * errors), case) for case in labels]
-        rows, label = max(fit, key=lambda pair: int(pair[0].sum()), default=(flags, None))
-        if label is None or (count := int(rows.sum())) < gates.LABEL_ROWS:
-            return None
-        lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
-        before, after = (1e3 * float(each[rows].median()) for each in (errors, label.errors))
-        what = f"{count} rows look wrong and fit {label.name}: lines {lines}"
-        expected = "rows that fit under their own label"
-        got = f"median errors of {before:.3g} mm, and of {after:.3g} mm so"
-        return sentence(what, expected=expected, got=got, fix="correct these labels")
-
     def drifting(self) -> Placed | None:
         """Add what may drift with columns of the table; None without such columns."""
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
@@ -321,12 +292,12 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     if coordinates is None:
         progress("geometry", 0, 1)
         registration = register_ball(robot, tables)
-        rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
+        rows = Rows(registration.geometry, tuple(map(KindRows.read, tables, registration.devices)))
         prior = None if resting_rows(tables) else Prior()  # readings alone do not tell it
         fit = _fitted(rows, tables, registration, prior, adrift=True)
         if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
             each = zip(tables, registration.devices, free, strict=True)
-            parts = tuple(ReadRows(data, opened or stated) for data, stated, opened in each)
+            parts = tuple(KindRows.read(data, opened or stated) for data, stated, opened in each)
             again = estimated(replace(rows, parts=parts), held_parameters(rows.geometry, adrift=True), prior)
             for devices in again.devices:
                 devices.check_freed(fit.noise, again.noise)
@@ -344,9 +315,10 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     if not all(map(sees_frame, tables)):
         fitted = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
         ball = ball_of(tables, fitted, ball_tip(readings, geometry.on[-1]))
-        geometry = geometry if ball is None else with_ball(geometry, ball)
+        if ball is not None:
+            geometry = geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
     devices = tuple(fitting_devices(other, geometry.points(other.q)) for other in tables)
-    rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points), *map(ReadRows, tables, devices)))
+    rows = Rows(geometry, (KindRows.positions(table.q, table.points), *map(KindRows.read, tables, devices)))
     if ball is not None:
         registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
@@ -355,7 +327,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     model, count = fit.geometry, table.markers  # without a ball, which a device does not see
     check_identification(table, replace(fit, geometry=model.with_tool(model.tool[:count], model.on[:count])))
     cameras = LensAndBoard.of_table(table, coordinates.rows, registration, sessions)
-    placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices, "the measuring frame")))
+    placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices)))
     return Placed(data, coordinates._replace(table=table), placement, registration, fit)
 
 

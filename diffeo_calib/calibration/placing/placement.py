@@ -125,10 +125,6 @@ class DeviceSet(ABC):
         """What would make the robot's size better known; nothing where these devices have a size of their own."""
         return ""
 
-    def labels(self, coordinates: Coordinates, predicted: Tensor) -> Iterable[OtherLabel]:
-        """How rows that tell coordinates would err under other device names; ``predicted`` (N, P, 3) by a model, m."""
-        return ()
-
     def hypotheses(self, data: Seen) -> Iterable[Hypothesis]:
         """What of these devices may change during the measurements, or be wrong, with effects (N, R, U) on all rows."""
         return ()
@@ -214,11 +210,3 @@ class Elsewhere(NamedTuple):
     there: Tensor  # (M,) boolean, where they can
     places: Tensor  # (D, 3) in the measuring frame, m, to which it has to bring the ball; none for anywhere
     changed: Callable[[Any], Any] = lambda copies: copies  # of a table, copies of the row at these joint values
-
-
-class OtherLabel(NamedTuple):
-    """How M rows would err with another label than theirs."""
-
-    name: str  # in words
-    applies: Tensor  # (M,) boolean, the rows that do not have it
-    errors: Tensor  # (M,) m

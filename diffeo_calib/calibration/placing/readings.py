@@ -17,33 +17,29 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot, pad
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, excluded
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,
+    KindRows,
     Prior,
-    ReadRows,
     Rows,
+    body_squares,
     described,
     solve,
 )
-from diffeo_calib.calibration.identification.registration import register_sockets, socket_means
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.cameras.images import projection
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.bodies import triple
-from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.readings import KIND, SEPARATOR, Readings, SocketReadings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import fitting_devices
 from diffeo_calib.sensors.devices import VALUE, Devices, Hypothesis, check_devices
@@ -53,27 +49,13 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import OtherReadings
 from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
-ROBOT_BASE = "the robot's base"
-"""Measuring frame of rows without a device."""
-FEWEST_BESIDE = 2
-"""Rows of a socket besides one that are needed to judge it."""
-
 
 @dataclass(frozen=True, eq=False)
 class ReadingDevices(DeviceSet):
-    """The devices of readings of one kind.
-
-    Args:
-        data: the readings. frame: that of the places of their devices, in words.
-    """
+    """The devices of readings of one kind."""
 
     devices: Devices
     data: Readings
-    frame: str
-
-    def reason(self, ball: Tensor, small: float) -> str:
-        """Probable cause of a row whose readings are wrong: its ``ball`` (3,), ``small`` an error that fits, m."""
-        return FAR
 
     @property
     def numbers(self) -> Tensor:
@@ -98,14 +80,9 @@ class ReadingDevices(DeviceSet):
             yield hypothesis._replace(effects=self._of_all_rows(hypothesis.effects, data))
 
     def settled(self, fit: Settled) -> ReadingDevices:
-        moved = self.devices.shifted(fit.shifts)
-        root = self._compared(self.devices.root, moved, fit)
+        root, moved = self.devices.root, self.devices.shifted(fit.shifts)
         std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt()
         return replace(self, devices=replace(moved, deviations=std.view_as(moved.deviations)))
-
-    def _compared(self, root: Tensor, moved: Devices, fit: Settled) -> Tensor:
-        """Those of the increments (D k, D k) that say where the devices are."""
-        return root
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         readings = next(part for part in other.readings if part.table.column_kind == self.data.column_kind)
@@ -121,9 +98,6 @@ class ReadingDevices(DeviceSet):
             "mm and rests on the robot's description"
         )
         warn_user(sentence(what, fix=self.devices.size_fix))
-
-    def sentences(self) -> list[str]:
-        return [self.devices.sentence(number, std, self.frame) for number, std in enumerate(self.devices.deviations)]
 
     def entry(self) -> dict[str, object]:
         values = {"constants": self.devices.constants, "deviations": self.devices.deviations}
@@ -150,9 +124,6 @@ class SocketDevices(ReadingDevices):
         """(S, 3) most probable places, m."""
         return self.devices.constants
 
-    def reason(self, ball: Tensor, small: float) -> str:
-        return other_socket(ball, self.positions, self.names, small)
-
     def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         if not bool((self.rows == row).any()):
             return super().elsewhere(row, points, devices)
@@ -176,18 +147,16 @@ class SocketDevices(ReadingDevices):
             yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
     def settled(self, fit: Settled) -> SocketDevices:
-        settled: Any = super().settled(fit)
-        settled = replace(settled, devices=replace(settled.devices, before=()))
+        moved, root = self.devices.shifted(fit.shifts).constants, self.devices.root
+        if fit.fitted.workspace is not None:  # no device tells where all of them are
+            B = frame_slopes(moved[None], moved.mean(0))[0]
+            root = root - B @ (torch.linalg.pinv(B) @ root)
+        std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt().view_as(moved)
+        settled = replace(self, devices=replace(self.devices, constants=moved, deviations=std, before=()))
         if fit.chosen is None:
             return settled
         away = socket_errors(self.left_out(fit.chosen), self.device, self.sockets)[0]
         return replace(settled, left_out_spread=float(away.square().sum(1).mean().sqrt()))
-
-    def _compared(self, root: Tensor, moved: Devices, fit: Settled) -> Tensor:
-        if fit.fitted.workspace is None:
-            return root
-        B = frame_slopes(moved.constants[None], moved.constants.mean(0))[0]  # no device tells where all of them are
-        return root - B @ (torch.linalg.pinv(B) @ root)
 
     def left_out(self, chosen: ChosenScales) -> Tensor:
         """The ball (M, 3) as predicted without the rows of its place, m: with A their block of (G + R)^-1, by A^-1 mu.
@@ -213,74 +182,19 @@ class SocketDevices(ReadingDevices):
         return {"sockets": {"positions_m": positions, "left_out_spread_m": self.left_out_spread}}
 
     def sentences(self) -> list[str]:
-        among = "among the sockets " * (self.frame == ROBOT_BASE)
-        each = zip(self.names, 1e3 * self.positions, 1e3 * self.devices.deviations, strict=True)
-        lines = [
-            f"socket '{name}': {triple(place)} mm in {self.frame}, deviations {among}{triple(deviation)} mm"
-            for name, place, deviation in each
-        ]
-        return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
+        what = "spread within sockets, each place left out"
+        among = "; deviations of sockets are among them where no device measured positions"
+        return [*super().sentences(), f"{what}: {1e3 * self.left_out_spread:.4f} mm{among}"]
 
 
-def other_socket(ball: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
-    """Why a ball (3,) is far from its socket: it may be in another one of places (S, 3), at most ``small`` m away."""
-    away = (ball - positions).norm(dim=1)
-    nearest = int(away.argmin())
-    if float(away[nearest]) > small:
-        return "far from where the other rows of its socket predict it"
-    return f"fits socket '{names[nearest]}': named after a wrong one?"
-
-
-SETS: Mapping[str, type[ReadingDevices]] = {KIND: SocketDevices}
-"""Sets of devices of readings but :class:`ReadingDevices`."""
-
-
-def reading_sets(
-    readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str = ROBOT_BASE
-) -> tuple[ReadingDevices, ...]:
-    """Sets of devices with what is known of them before a fit around places where they were found.
-
-    Args:
-        readings: the rows that they measured. devices: of each of these. frame: that of the devices, in words.
-    """
+def reading_sets(readings: Sequence[OtherReadings], devices: Sequence[Devices]) -> tuple[ReadingDevices, ...]:
+    """Sets of devices and their rows, with what is known of them before a fit, around places where they were found."""
     sets = list[ReadingDevices]()
     for (table, rows), old in zip(readings, devices, strict=True):
         around = type(old).of(table, old.constants)
-        part = SETS.get(table.kind, ReadingDevices)(around, table, frame)
-        sets.append(part.measuring(rows, around.numbers(table)))
+        kind = SocketDevices if table.kind == KIND else ReadingDevices
+        sets.append(kind(around, table).measuring(rows, around.numbers(table)))
     return tuple(sets)
-
-
-def contradicted_in_sockets(model: CalibratedKinematics, data: Any) -> list[Outlier]:
-    """Rows whose ball the model excludes from the middle of their socket, the worst first.
-
-    Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
-    wide prior that its rows share. The median distance says in which unit the model's deviations are to be taken: they
-    hold for errors elsewhere, and the rows of a socket share most of these.
-
-    Args:
-        model: of rows in sockets. data: rows of any kinds that took no part in its fit; those of other kinds are left
-            out.
-    """
-    outliers, fitted = list[Outlier](), model.map
-    for table in resting_rows(data.parts):
-        socket, predicted = table.device.to(table.q.device), fitted(table.q).detach()[:, -3:]
-        eye, rests = torch.eye(3, dtype=predicted.dtype, device=predicted.device), one_hot(socket).to(predicted)
-        at = fitted.geodesic.linearise(table.q).projected(pad(eye, (fitted.m - 3, 0)).expand(len(table), -1, -1))
-        K = fitted.conditional.covariance_between(at) + PLACES.found_m_rad**2 * torch.kron(rests @ rests.T, eye)
-        K = K + torch.block_diag(*fitted.new_noise[-3:, -3:].expand(len(table), -1, -1))
-        middles, inverse = socket_means(predicted, socket), torch.linalg.inv(K)
-        precisions, solved = own_blocks(inverse[None], len(table))[0], inverse @ (middles[socket] - predicted).flatten()
-        away = torch.linalg.solve(precisions, solved.view(-1, 3))
-        judged = (rests.sum(0)[socket] > FEWEST_BESIDE)[:, None]
-        squares = (away * solved.view(-1, 3)).sum(1, keepdim=True).masked_fill(~judged, torch.nan)
-        bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0) if bool(judged.any()) else judged
-        for row in bad.nonzero()[:, 0].tolist():
-            small = gates.REMAINING_ERROR * float((predicted[row] - middles[socket[row]]).norm())
-            reason = other_socket(predicted[row], middles, table.names, small)
-            line, name = int(table.line_numbers[row]), table.row_names[row]
-            outliers.append(Outlier(row, None, line, name, float(away[row].norm()), None, reason))
-    return sorted(outliers, key=lambda outlier: -outlier.distance)
 
 
 # --- where a fit starts -----------------------------------------------------------------------------------------------
@@ -325,7 +239,7 @@ def register_ball(robot: Tree, tables: Sequence[Readings]) -> Identification:
         start = register_sockets(bare, resting.q, resting.device)
         check_socket_registration(robot, resting, start)
         devices = [fitting_devices(table, start.geometry.points(table.q)) for table in tables]
-        return described(Rows(start.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
+        return described(Rows(start.geometry, tuple(map(KindRows.read, tables, devices))), adrift=True)
     return register_readings(bare, tables)
 
 
@@ -353,30 +267,29 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    most, fits = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
-    doubted = bool(fits) and fits[0].worst[0] > DOUBTED_SHARE * bare.chain.reach
-    for factor, words in ((1e3, "small"), (1e-3, "large")) if doubted else ():
+    reach = bare.chain.reach
+    most, fits = LARGEST_SHARE * reach, _rough_fits(bare, tables, bare.tool[:1])
+    for factor, words in ((1e3, "small"), (1e-3, "large")) if fits and fits[0].worst > DOUBTED_SHARE * reach else ():
         other = [replace(part, values=factor * part.values) if part.unit[0] == "mm" else part for part in tables]
         there = _rough_fits(bare, other, bare.tool[:1])
-        if there and there[0].worst[0] < min(most, FAR_BETTER * fits[0].worst[0]):
+        if there and there[0].worst < min(most, FAR_BETTER * fits[0].worst):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
-            raise MeasurementError.of(UNEXPLAINED, **fits[0].said(most), fix=fix)
-    if not fits or fits[0].worst[0] > most:
+            raise MeasurementError.of(UNEXPLAINED, got=fits[0].text, fix=fix)
+    if not fits or fits[0].worst > most:
         balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
         fits = sorted([*fits, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
     if not fits:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    best = fits[0]
-    if best.worst[0] > most:
-        warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
-    noise = float(torch.cat([part.flatten() for part in best.errors]).square().mean().sqrt())
-    return described(best.rows, [noise] * len(tables), adrift=True)
+    if fits[0].worst > most:
+        expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"
+        warn_user(sentence(UNEXPLAINED, expected=expected, got=fits[0].text, fix=CHECK))
+    return described(fits[0].rows, [fits[0].noise] * len(tables), adrift=True)
 
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
     """RMS error of the readings from the start of :func:`register_readings`, m; infinite where none leads on."""
     fits = _rough_fits(bare, tables, bare.tool[:1], ftol=COMPARED)
-    return float(torch.cat([part.flatten() for part in fits[0].errors]).square().mean().sqrt()) if fits else inf
+    return fits[0].noise if fits else inf
 
 
 def images_error(robot: Tree, data: Readings) -> float:
@@ -408,20 +321,17 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
 
 
 class RoughFit(NamedTuple):
-    """Ball and devices from one start, with errors (N, 1, r) of all readings, m.
+    """Ball and devices from one start."""
 
-    The largest median residual of a device, m, with its name: one wrong plane of three shows in it.
-    """
-
-    worst: tuple[float, str]
+    worst: float  # the largest median residual of a device, m: one wrong plane of three shows in it
+    device: str  # its name
     rows: Rows
-    errors: list[Tensor]
+    noise: float  # RMS error of all readings, m
 
-    def said(self, most: float) -> dict[str, str]:
-        """What a message says of it, with the largest median that belongs to a robot, m."""
-        median, device = self.worst
-        expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"
-        return {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}"}
+    @property
+    def text(self) -> str:
+        """What a message says of it."""
+        return f"a median of {1e3 * self.worst:.3g} mm at {as_written(self.device)}"
 
 
 def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor, **how: float) -> list[RoughFit]:
@@ -441,7 +351,7 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     """Ball and devices, from these in closed form around a ball (3,), errors of joints zero."""
     geometry = bare.with_tool(ball[None])
     devices = [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables]
-    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)))
+    rows = Rows(geometry, tuple(map(KindRows.read, tables, devices)))
     sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
     root = Prior().root(geometry, range(geometry.slices["tool"].start))
     fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1", **how)
@@ -452,4 +362,5 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     )
     each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
     moved = [device for part, some in each for device in part.devices(some)]
-    return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
+    rows = Rows(geometry.absorb(fit.theta), tuple(map(KindRows.read, tables, moved)))
+    return RoughFit(*worst, rows, float(body_squares(fit.errors).sum() / sum(map(torch.numel, fit.errors))) ** 0.5)

@@ -1,23 +1,20 @@
 """Campaigns in several set-ups: the device, or the robot's foot, has moved between some rows and others, or markers.
 
-Every session has its own measuring frame, T_s from that of the largest session (the reference) to its own. The frames
-are found with a geometric calibration, all rows are brought into the frame of the reference, and what is left of the
-differences is fitted with everything else: each session but the reference has six shifts and turns of its frame and
-three shifts of every marker (a tool that was mounted again), which its rows share, as noise with a prior. Where the
-device stayed, and the markers alone were mounted anew, their shifts are found in place of the frames.
+Every session has a measuring frame, or markers, that differ from those of the largest session, the reference. They are
+found with a geometric calibration, all rows are brought to the reference, and what is left of the differences is fitted
+with everything else: shifts and turns of each frame and shifts of every marker, as noise with a prior that rows share.
 
-Slow drift of device and arm in proportion to a column, such as time or temperature: between its smallest and largest
-value the measuring frame shifts and turns, lengths grow, and every joint offset changes, by unknowns u with a wide
-prior that all rows share: row i differs from the model by a_i B_i u with a_i from -1/2 to 1/2, so that the model holds
-for the middle of the column. They stay in the fit where they predict rows that are left out better, see
-diagnostics/hypotheses.py.
+Slow drift of device and arm with a column, such as time or temperature: between its smallest and largest value the
+measuring frame shifts and turns, lengths grow, and every joint offset changes, by unknowns u with a wide prior: row i
+differs from the model by a_i B_i u with a_i from -1/2 to 1/2, so that the model holds for the middle of the column.
+They stay in the fit where they predict rows that are left out better, see diagnostics/hypotheses.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,11 +23,9 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_inliers, registered_geometry, spread
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
-from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -38,7 +33,6 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.known_drift import OFFSETS, KnownDrift
 from diffeo_calib.sensors.set_ups import (
-    SESSION,
     MeasuringFrames,
     MountedMarkers,
     SetUps,
@@ -78,11 +72,8 @@ class Sessions(DeviceSet):
             other = MeasuringFrames if table.remounted else MountedMarkers
             ratio = cls.find(robot, table, other)[1] / median if table.lever is None else 1.0
             if ratio < TOLD_APART:
-                moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
-                what, stayed = moved[table.remounted]
-                words = (
-                    f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
-                )
+                moved = ("markers were mounted anew", "device was moved")[table.remounted]
+                words = f"the sessions fit {1 / ratio:.2g} times better if between them the {moved} and all else stayed"
                 option = "leave out" if table.remounted else "add"
                 fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
                 warn_user(sentence(words, fix=fix))
@@ -102,15 +93,15 @@ class Sessions(DeviceSet):
             start = registered_geometry(robot, data.q, together.points, marker_tips(robot, data))
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
-        median, rows, name = max(
-            ((float(away[rows].nanmedian()), rows, name) for name, rows in sessions.groups()), key=lambda each: each[0]
-        )
+        each = [(sessions.rows[sessions.device == number], name) for number, name in enumerate(sessions.names)]
+        median, worst = max((float(away[rows].nanmedian()), number) for number, (rows, _) in enumerate(each))
+        rows, name = each[worst]
         alone = data.rows(rows).with_sessions(None)
         if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
             try:
                 refuse_mistakes(robot, alone)
             except MeasurementError as error:
-                raise MeasurementError(f"{name}: {error}") from error
+                raise MeasurementError(f"session '{name}': {error}") from error
         return sessions, median
 
     @classmethod
@@ -140,10 +131,6 @@ class Sessions(DeviceSet):
         """(S, 4, 4) from the frame of the reference to that of each session, or on the tool, m."""
         return self.devices.constants.unflatten(1, (4, 4))
 
-    def groups(self) -> list[tuple[str, Tensor]]:
-        """Rows (k,) of each session by its name in words."""
-        return [(f"session '{name}'", self.rows[self.device == k]) for k, name in enumerate(self.names)]
-
     @property
     def others(self) -> list[int]:
         """Numbers of the sessions but the reference."""
@@ -170,15 +157,6 @@ class Sessions(DeviceSet):
         moved = self.devices.moved(self.others, steps, std, fit.centre, fit.transform)
         return replace(self, devices=moved if fit.known is None else moved.after(fit.known))
 
-    def labels(self, coordinates: Coordinates, predicted: Tensor) -> Iterator[OtherLabel]:
-        session = self.by_row(int(coordinates.rows.max()) + 1)[coordinates.rows]
-        points, count = coordinates.table.points, self.markers
-        for number, name in enumerate(self.names if self.devices.kind == SESSION else ()):
-            T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
-            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - predicted[:, :count]
-            applies = (session != number) & (session != NO_SOCKET)
-            yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
-
     def entry(self) -> dict[str, object]:
         return {self.devices.key: self.devices.entry()}
 
@@ -196,16 +174,15 @@ FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Drift(DeviceSet):
-    """Drift of N rows with K columns."""
+    """Drift of rows with K columns."""
 
     devices: KnownDrift  # what was found, or zero before a fit
-    ramp: Tensor  # (N, K) from -1/2 to 1/2
-    q: Tensor  # (N, n) configurations
+    data: Any  # the rows
     # (3,) about which the frame turns and lengths grow, m; by default the middle of the rows
     centre: Tensor | None = None
 
     @classmethod
-    def of_table(cls, data: Measurements | Readings | Observations, chain: Tree) -> list[DeviceSet]:
+    def of_table(cls, data: Any, chain: Tree) -> list[DeviceSet]:
         """A drift with every column of a table that is not constant; none without any."""
         values = data.covariates
         if values is None or not bool((values.amax(0) > values.amin(0)).all()):
@@ -213,27 +190,33 @@ class Drift(DeviceSet):
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
-        drift = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
-        return [cls(drift, drift.ramp(data), data.q)]
+        constants = torch.cat([torch.stack(ends, 1), nothing], 1)
+        return [cls(KnownDrift(data.covariate_names, constants, nothing, joints=joints), data)]
 
     def effects(self, data: Seen) -> Tensor:
         places = data.points.unflatten(1, (-1, 3))
         centre = places.mean((0, 1)) if self.centre is None else self.centre
-        frame, away = FRAME_M_RAD * frame_slopes(places, centre), (places - centre).flatten(1)[..., None]
-        offsets = OFFSET_RAD_M * data.nominal.jacobian(self.q, data.y.new_zeros(data.nominal.parameters))
-        whole = data.slopes @ torch.cat([frame, GROWTH * away, offsets], 2)
-        return (whole[:, :, None] * self.ramp[:, None, :, None]).flatten(2)
+        away = (places - centre).flatten(1)[..., None]
+        offsets = data.nominal.jacobian(self.data.q, data.y.new_zeros(data.nominal.parameters))
+        whole = data.slopes @ (torch.cat([frame_slopes(places, centre), away, offsets], 2) * self.units)
+        return (whole[:, :, None] * self.devices.ramp(self.data)[:, None, :, None]).flatten(2)
+
+    @property
+    def units(self) -> Tensor:
+        """(7 + n,) prior standard deviations of the unknowns."""
+        units = [FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints)
+        return self.devices.constants.new_tensor(units)
 
     def settled(self, fit: Settled) -> Drift:
-        units = fit.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
-        shifts = units * fit.shifts.view(len(self.names), -1)
-        deviations = units * fit.covariance.diagonal().sqrt().view(len(self.names), -1)
+        shifts = self.units * fit.shifts.view(len(self.names), -1)
+        deviations = self.units * fit.covariance.diagonal().sqrt().view(len(self.names), -1)
         constants = torch.cat([self.devices.constants[:, :2], fit.centre.expand(len(shifts), 3), shifts], 1)
-        drift = replace(self.devices, constants=constants, deviations=deviations)
-        return replace(self, devices=drift, centre=fit.centre)
+        return replace(
+            self, devices=replace(self.devices, constants=constants, deviations=deviations), centre=fit.centre
+        )
 
     def with_rows(self, other: OtherRows) -> Drift:
-        return replace(self, ramp=self.devices.ramp(other.data), q=other.data.q, centre=other.centre)
+        return replace(self, data=other.data, centre=other.centre)
 
     def sentences(self) -> list[str]:
         """How much drifted with each column, of what is known well."""

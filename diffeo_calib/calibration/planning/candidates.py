@@ -1,8 +1,7 @@
-"""Configurations that can be measured, drawn at random: within the joints' ranges, and whatever else is asked.
+"""Configurations that can be measured, drawn at random within the joints' ranges and other criteria.
 
-That is the view of the measuring device, a floor, a column, the user's own check: a criterion takes configurations
-(N, n) and says which are allowed (N,). Links are straight lines from one joint's origin to the next, and on to the tip
-and the markers: leave room for the links' thickness in floors and columns.
+Links are straight lines from one joint's origin to the next, and on to the tip and the markers: leave room for the
+links' thickness in floors and columns.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 
-POINTS_PER_LINK = 8
-"""Points of each link that are checked: 8 cm apart on a link of 0.6 m."""
+POINTS_PER_LINK = 8  # points of each link that are checked: 8 cm apart on a link of 0.6 m
 
 Criterion = Callable[[Tensor], Any]
 """Configurations (N, n) -> (N,) boolean, whether each is allowed."""
@@ -113,10 +111,8 @@ def _links(robot: Tree, q: Tensor, points: Tensor) -> Tensor:
 
 
 TURN = 2 * pi
-MOST_TURNS = 10
-"""Turns of a joint without limits that may be asked for."""
-ROUNDING = 1e-6
-"""Of limits in files, rad or m."""
+MOST_TURNS = 10  # turns of a joint without limits that may be asked for
+ROUNDING = 1e-6  # of limits in files, rad or m
 MOST = 10_000_000
 CONFIGURATIONS_AT_ONCE = 4096
 """Configurations that are drawn together, at most: for sockets four times as many as are asked for at first."""
@@ -124,8 +120,7 @@ FIRST_DRAWS = 100_000
 REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
 """Damped Gauss-Newton steps that bring a ball to its place, the longest of a joint [rad or m], and their damping."""
 REACHED_M = 1e-4
-BEYOND_SHARE = 0.25
-"""Of the range of a joint, how far beyond it configurations are near those that have it."""
+BEYOND_SHARE = 0.25  # of the range of a joint, how far beyond it configurations are near those that have it
 LEAST_SHARE = 1e-3
 """Share of the draws that must be accepted, judged from the first draws on: below it the search would not end."""
 
@@ -183,8 +178,7 @@ def candidates(
         at_ball = as_tensor((0.0, 0.0, 0.0) if ball is None else ball, "ball", (3,))
         criteria = {"places": lambda q: ((q >= lower) & (q <= upper)).all(1), **criteria}
     generator, batches = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
-    asked = dict.fromkeys(criteria, 0)
-    passed = dict.fromkeys(criteria, 0)
+    refused = dict.fromkeys(criteria, 0)
     drawn, accepted, together = 0, 0, CONFIGURATIONS_AT_ONCE if places is None else count
     while accepted < count:
         together = min(CONFIGURATIONS_AT_ONCE, 4 * together)
@@ -193,13 +187,12 @@ def candidates(
         if places is not None:
             q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
         for name, criterion in criteria.items():
-            asked[name] += len(q)
-            q = q[_allowed(name, criterion, q)] if len(q) else q
-            passed[name] += len(q)
+            allowed = _allowed(name, criterion, q) if len(q) else torch.ones(0, dtype=torch.bool, device=HOST)
+            refused[name], q = refused[name] + int((~allowed).sum()), q[allowed]
         drawn, accepted = drawn + together, accepted + len(q)
         batches.append(q)
         if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
-            raise _too_few(drawn, accepted, asked, passed)
+            raise _too_few(drawn, refused)
     return torch.cat(batches)[:count]
 
 
@@ -242,27 +235,22 @@ def ranges_around(robot: Tree, q: Tensor) -> dict[str, tuple[float, float]]:
 
 def _given(name: str, ends: object, limits: Sequence[float]) -> tuple[float, float]:
     lower, upper = as_tensor(ends, f"ranges['{name}']", (2,), fix="pass (lower, upper)").tolist()
-    if not lower <= upper:
-        raise InputError.of(f"`ranges['{name}']`", expected="lower <= upper", got=f"{lower:g}, {upper:g}")
-    least, most = (
-        end if isfinite(end) else sign * MOST_TURNS * TURN for end, sign in zip(limits, (-1, 1), strict=True)
-    )
-    if lower < least - ROUNDING or upper > most + ROUNDING:
-        expected, got = f"within the joint's limits, {least:g} to {most:g}", f"{lower:g} to {upper:g}"
+    least, most = (max(limits[0], -MOST_TURNS * TURN), min(limits[1], MOST_TURNS * TURN))
+    if not least - ROUNDING <= lower <= upper <= most + ROUNDING:
+        expected = f"lower <= upper within the joint's limits, {least:g} to {most:g}"
+        got = f"{lower:g} to {upper:g}"
         raise InputError.of(f"`ranges['{name}']`", expected=expected, got=got, fix="check the unit, rad or m")
     return lower, upper
 
 
 def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, float]:
     """The limits of a joint, or one turn of them."""
-    if not turns:
-        if not (isfinite(lower) and isfinite(upper)):
-            fix = f"pass ranges={{'{name}': (lower, upper)}} in m"
-            raise InputError.of(f"the prismatic joint '{name}' has no limits", fix=fix)
+    if not turns and not (isfinite(lower) and isfinite(upper)):
+        fix = f"pass ranges={{'{name}': (lower, upper)}} in m"
+        raise InputError.of(f"the prismatic joint '{name}' has no limits", fix=fix)
+    if not turns or upper - lower <= TURN:
         return lower, upper
-    if upper - lower <= TURN:
-        return lower, upper
-    if isfinite(lower) and lower > -pi:
+    if lower > -pi:
         return lower, lower + TURN
     return (upper - TURN, upper) if upper < pi else (-pi, pi)
 
@@ -315,15 +303,16 @@ def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
     return torch.from_numpy(value.copy())
 
 
-def _too_few(drawn: int, accepted: int, asked: dict[str, int], passed: dict[str, int]) -> InputError:
-    """Names the criterion that refuses the largest share of what reaches it."""
-    shares = {name: 1 - passed[name] / asked[name] for name in asked if asked[name]}
+def _too_few(drawn: int, refused: dict[str, int]) -> InputError:
+    """Names the criterion that refuses the largest share of what those before it accept."""
+    shares, left = {}, drawn
+    for name, count in refused.items():
+        shares[name], left = count / max(left, 1), left - count
     worst = max(shares, key=lambda name: shares[name])
-    each = ", ".join(f"`{name}` {100 * shares.get(name, 0):.2f} % of {asked[name]}" for name in asked)
     return InputError.of(
-        f"`{worst}` refuses nearly everything: {accepted} of {drawn} random configurations can be measured",
+        f"`{worst}` refuses nearly everything: {left} of {drawn} random configurations can be measured",
         expected=f"at least one in {1 / LEAST_SHARE:.0f}",
-        got=f"refused one after the other: {each}",
+        got=", ".join(f"`{name}` refuses {100 * share:.2f} %" for name, share in shares.items()),
         fix=f"check the frame and the units of `{worst}`, or narrow the joints' ranges",
     )
 
@@ -357,70 +346,51 @@ def collision_free(
     except ImportError as error:
         fix = "pip install 'diffeo_calib[collisions]', or pass your own check as `keep`"
         raise InputError.of("collisions need the package pinocchio, which is not installed", fix=fix) from error
-    world = _World(pin, robot, [str(path) for path in packages])
+    model, bodies = _collision_model(pin, robot, [str(path) for path in packages])
+    joints = [model.joints[model.getJointId(name)] for name in robot.moving_names]
+    data, checked = model.createData(), pin.GeometryData(bodies)
+
+    def collisions(row: Tensor, *, first: bool) -> bool:
+        """Whether bodies collide at a configuration (n,); pinocchio has pairs (cos, sin) for continuous joints."""
+        full = pin.neutral(model)
+        for joint, value in zip(joints, robot.moving_values(row[None])[0].tolist(), strict=True):
+            full[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else value
+        return pin.computeCollisions(model, data, bodies, checked, full, first)
+
     ends = zip(robot.joint_names, robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
     lower, upper = joint_ranges(robot, {name: (0.0, 1.0) for name, turns, limited in ends if not (turns or limited)})
-    draw = np.random.default_rng(seed).random((ALWAYS_DRAWS, robot.n))
-    world.leave_out_constant(lower.numpy() + (upper - lower).numpy() * draw)
-    return lambda q: torch.tensor([world.free(row) for row in q.cpu().numpy()], dtype=torch.bool, device=HOST)
+    always = np.ones(len(bodies.collisionPairs), dtype=bool)
+    for draw in np.random.default_rng(seed).random((ALWAYS_DRAWS, robot.n)):
+        collisions(lower + (upper - lower) * torch.from_numpy(draw), first=False)
+        always &= np.array([result.isCollision() for result in checked.collisionResults], dtype=bool)
+    pairs = [(pair.first, pair.second) for pair in bodies.collisionPairs]
+    for pair, constant in zip(pairs, always, strict=True):
+        if constant:
+            bodies.removeCollisionPair(pin.CollisionPair(*pair))
+    checked = pin.GeometryData(bodies)
+    return lambda q: torch.tensor([not collisions(row, first=True) for row in q.cpu()], dtype=torch.bool, device=HOST)
 
 
-class _World:
-    """The bodies of a URDF and the pairs that may collide."""
-
-    def __init__(self, pin: Any, robot: Tree, packages: list[str]) -> None:
-        if robot.source is None:
-            fix = "load it with dc.load_urdf, or pass your own check as `keep`"
-            what = f"robot '{robot.name}' was not read from a URDF, which holds collision geometry"
-            raise InputError.of(what, fix=fix)
-        self.pin = pin
-        source = robot.source.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-        try:
-            self.model = pin.buildModelFromXML(source)
-            kind = pin.GeometryType.COLLISION
-            self.bodies = pin.buildGeomFromUrdfString(self.model, source, kind, package_dirs=packages)
-        except (ValueError, RuntimeError) as error:
-            what = f"the collision geometry of robot '{robot.name}' cannot be read ({' '.join(str(error).split())})"
-            raise InputError.of(what, fix="name the folders of its meshes (`packages`)") from error
-        if not self.bodies.ngeoms:
-            raise InputError.of(f"the URDF of robot '{robot.name}' has no collision geometry", fix="leave it out")
-        self.data = self.model.createData()
-        missing = [name for name in robot.moving_names if not self.model.existJointName(name)]
-        if missing:
-            raise InputError.of(f"pinocchio finds no joint {few(missing)} in the URDF", fix="pass your own check")
-        self.joints = [self.model.joints[self.model.getJointId(name)] for name in robot.moving_names]
-        self.robot = robot
-        pairs = combinations(range(self.bodies.ngeoms), 2)
-        self._pairs([pair for pair in pairs if not self._joined(*pair)])
-
-    def free(self, q: np.ndarray) -> bool:
-        """Whether no pair collides: q (n,)."""
-        return not self.pin.computeCollisions(self.model, self.data, self.bodies, self.checked, self._full(q), True)
-
-    def leave_out_constant(self, q: np.ndarray) -> None:
-        """Leave out pairs that collide in all of these configurations (N, n)."""
-        always = np.ones(len(self.bodies.collisionPairs), dtype=bool)
-        for row in q:
-            self.pin.computeCollisions(self.model, self.data, self.bodies, self.checked, self._full(row), False)
-            always &= np.array([result.isCollision() for result in self.checked.collisionResults], dtype=bool)
-        pairs = [(pair.first, pair.second) for pair in self.bodies.collisionPairs]
-        self._pairs([pair for pair, constant in zip(pairs, always, strict=True) if not constant])
-
-    def _pairs(self, pairs: list[tuple[int, int]]) -> None:
-        self.bodies.removeAllCollisionPairs()
-        for first, second in pairs:
-            self.bodies.addCollisionPair(self.pin.CollisionPair(first, second))
-        self.checked = self.pin.GeometryData(self.bodies)
-
-    def _joined(self, first: int, second: int) -> bool:
-        """Whether two bodies move together or are neighbours."""
-        a, b = (self.bodies.geometryObjects[k].parentJoint for k in (first, second))
-        return a == b or self.model.parents[a] == b or self.model.parents[b] == a
-
-    def _full(self, q: np.ndarray) -> np.ndarray:
-        """Pinocchio's configuration; continuous joints are pairs (cos, sin) there."""
-        full = self.pin.neutral(self.model)
-        values = self.robot.moving_values(torch.from_numpy(np.atleast_2d(q)))[0].tolist()
-        for joint, value in zip(self.joints, values, strict=True):
-            full[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else value
-        return full
+def _collision_model(pin: Any, robot: Tree, packages: list[str]) -> tuple[Any, Any]:
+    """Pinocchio's model of a URDF, and its bodies with the pairs that may collide, none of neighbours."""
+    if robot.source is None:
+        fix = "load it with dc.load_urdf, or pass your own check as `keep`"
+        what = f"robot '{robot.name}' was not read from a URDF, which holds collision geometry"
+        raise InputError.of(what, fix=fix)
+    source = robot.source.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    try:
+        model = pin.buildModelFromXML(source)
+        bodies = pin.buildGeomFromUrdfString(model, source, pin.GeometryType.COLLISION, package_dirs=packages)
+    except (ValueError, RuntimeError) as error:
+        what = f"the collision geometry of robot '{robot.name}' cannot be read ({' '.join(str(error).split())})"
+        raise InputError.of(what, fix="name the folders of its meshes (`packages`)") from error
+    if not bodies.ngeoms:
+        raise InputError.of(f"the URDF of robot '{robot.name}' has no collision geometry", fix="leave it out")
+    if missing := [name for name in robot.moving_names if not model.existJointName(name)]:
+        raise InputError.of(f"pinocchio finds no joint {few(missing)} in the URDF", fix="pass your own check")
+    bodies.removeAllCollisionPairs()
+    for first, second in combinations(range(bodies.ngeoms), 2):
+        a, b = (bodies.geometryObjects[k].parentJoint for k in (first, second))
+        if not (a == b or model.parents[a] == b or model.parents[b] == a):
+            bodies.addCollisionPair(pin.CollisionPair(first, second))
+    return model, bodies

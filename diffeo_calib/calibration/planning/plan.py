@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
-from diffeo_calib.calibration.planning.knowledge import FREE, Scene, of_model, of_robot
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, sensors_for
+from diffeo_calib.calibration.planning.scene import Scene, followed, of_model, of_robot
+from diffeo_calib.calibration.planning.sensors import Options, Sensor, sensors_for
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import HOST, outside_inference_mode
@@ -31,8 +31,7 @@ from diffeo_calib.robots.tree import Tree
 
 SMALLEST_STROKE = 1e-9
 
-JOINT_DIGITS = 6
-"""Decimal places of joint values in a plan: no controller takes more."""
+JOINT_DIGITS = 6  # decimal places of joint values in a plan: no controller takes more
 
 
 def short_path(q: Tensor, turning: tuple[bool, ...]) -> Tensor:
@@ -65,6 +64,7 @@ def short_path(q: Tensor, turning: tuple[bool, ...]) -> Tensor:
 
 
 LOG = logging.getLogger(__name__)
+FREE = (None, "base", "marker", "both")
 COUNTS = (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 200, 250, 300, 400, 500, 600, 800, 1000)
 """Numbers of poses at which a plan says what it expects."""
 
@@ -121,11 +121,6 @@ class Plan:
     def counts(self) -> tuple[int, ...]:
         """Some numbers of poses up to that of the plan, at which to look at ``expected_rms``."""
         return (*(count for count in COUNTS if count < len(self)), len(self))
-
-    def needed(self, rms: float) -> int | None:
-        """The least number of planned poses that brings the expected RMS down to ``rms`` [m]; None if none does."""
-        good = (self.expected_rms <= rms).nonzero()
-        return int(good[0]) if len(good) else None
 
     def to_csv(
         self, path: str | PathLike[str], *, length: str = "m", angle: str = "rad", sep: str = ",", decimal: str = "."
@@ -208,41 +203,34 @@ def plan(
             limits, a marker beyond its reach, fewer candidates than poses that a device can measure, or an argument
             that belongs to a robot with a model, and vice versa.
     """
-    if not isinstance(robot_or_model, Tree | CalibratedKinematics):
-        expected = "a robot (dc.Tree) or its model (dc.CalibratedKinematics)"
-        raise InputError.of("`robot_or_model`", expected=expected, got=type(robot_or_model).__name__)
-    robot = robot_or_model if isinstance(robot_or_model, Tree) else robot_or_model.robot
+    robot = _checked(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     q = _configurations(robot, candidates, "candidates")
     check_limits(robot, q, "candidates")
     check_count(count, "`count`, at most the number of candidates", most=len(q))
-    _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     near = q if target is None else _configurations(robot, target, "target")
-    earlier = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
-    groups = near, earlier, q
     if isinstance(robot_or_model, Tree):
-        how = {"frames": any(one.of_frames for one in sensors), "free": not any(one.of_positions for one in sensors)}
-        scene, at = of_robot(robot_or_model, (marker, hyperparameters), groups, **how)
+        flags = {"frames": any(one.of_frames for one in sensors), "free": not any(one.of_positions for one in sensors)}
+        scene = of_robot(robot_or_model, marker, hyperparameters, near, **flags)
     else:
-        scene, at = of_model(robot_or_model, free, groups)
-    targets, *before, wanted = at
-    measured_rows = list(_measured(scene, sensors, *before))
-    parts = [part for one in sensors for part in one.told(scene, wanted)]
+        scene = of_model(robot_or_model, free)
+    wanted, near = scene.view(q), scene.view(followed(near, scene.averaged.shape[1]))
+    parts = [part for one in sensors for part in one.measured(scene, wanted)]
     reachable = len(torch.cat([part.rows for part in parts]).unique())
     if reachable < count:
         fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
         what, fix = "candidates that can be measured", fix + "its sockets"
         raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
-    options = Options.of(scene, parts)
+    options = Options.of(scene, wanted, parts)
     new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
     posterior: Conditional = Opened(scene.known, scene.columns, new)
-    for rows in measured_rows:
+    if measured is not None:
+        rows = _measured(scene, sensors, _configurations(robot, measured, "measured"))
         posterior = Conditional.given(posterior, Numbers.of(rows.at), rows.noise)  # of any size
-    order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), targets, count)
+    order, variance = scene.chosen(posterior, (options.at, options.noise, options.rows), near.at, count)
     LOG.info("%d poses chosen of %d", count, len(q))
-    noise = 3 * scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
-    stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
-    rows, names = options.rows[order] - int(wanted[0]), [parts[k].name for k in options.device[order].tolist()]
+    stated = next((one.std**2 for one in sensors if one.of_positions and one.std is not None), None)
+    rows, names = options.rows[order], [options.devices[k] for k in order]
     path = short_path(q[rows], robot.periodic)
     return Plan(
         q=q[rows][path],
@@ -250,7 +238,7 @@ def plan(
         rows=rows[path],
         devices=tuple(names[k] for k in path.tolist()) if len(parts) > 1 else (),
         expected_rms=(3 * variance).sqrt(),
-        noise_rms=stated**0.5,
+        noise_rms=(3 * float(scene.variance(near.noise) if stated is None else stated)) ** 0.5,
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
@@ -258,17 +246,14 @@ def plan(
     )
 
 
-def _measured(scene: Scene, sensors: Sequence[Sensor], earlier: Tensor, registration: Tensor) -> Iterator[Options]:
-    """What was measured already: by one device, and by that of a registration, which measured positions or poses."""
-    if len(earlier):
-        parts = [part for sensor in sensors for part in sensor.told(scene, earlier)]
-        if len(parts) > 1 or len(parts[0].rows) < len(earlier):
-            fix = "leave `measured` out, and fit the model again with these rows"
-            raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
-        yield Options.of(scene, parts)
-    if len(registration):
-        parts = Positions(of_frames=scene.framed).told(scene._replace(unplaced=False), registration)
-        yield Options.of(scene, list(parts))
+def _measured(scene: Scene, sensors: Sequence[Sensor], earlier: Tensor) -> Options:
+    """What one device measured already."""
+    view = scene.view(earlier)
+    parts = [part for sensor in sensors for part in sensor.measured(scene, view)]
+    if len(parts) > 1 or len(parts[0].rows) < len(earlier):
+        fix = "leave `measured` out, and fit the model again with these rows"
+        raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
+    return Options.of(scene, view, parts)
 
 
 def drawn(
@@ -277,7 +262,6 @@ def drawn(
     count: int,
     markers: Tensor,
     *,
-    ranges: Mapping[str, Sequence[float]] | None = None,
     keep: Criterion | None = None,
     tracker: Tracker | None = None,
     **cell: Any,
@@ -288,33 +272,29 @@ def drawn(
 
     Args:
         given: a robot, or a model of it. markers: (P, 3) in the frame of the tip, m; the ball last.
-        ranges, keep, tracker, cell: as of :func:`candidates`; the reflector of the tracker is one of the markers.
-
-    Raises:
-        InputError: as there.
+        keep, tracker, cell: as of :func:`candidates`; the reflector of the tracker is one of the markers.
     """
     model = isinstance(given, CalibratedKinematics)
-    base = given.geometry.base if model else torch.eye(4, dtype=torch.float64, device=HOST)
+    robot, base = (
+        (given.robot, given.geometry.base) if model else (given, torch.eye(4, dtype=torch.float64, device=HOST))
+    )
     reached = [sensor.reached(base) for sensor in sensors]
+    groups = [(number, {}) for number in [reached.count({})] if number]
+    groups += [(1, where) for where in reached if "keep" in where]
     held = [where["places"] for where in reached if "places" in where]  # all sockets are one sensor
-    each: list[tuple[int, dict[str, Any], Tensor]] = [
-        (reached.count({}), {}, markers.mean(0)),
-        *((1, where, markers.mean(0)) for where in reached if "keep" in where),
-        (int(bool(held)), {"places": torch.cat(held) if held else None}, markers[-1]),
-    ]
-    whole, draws = sum(number for number, *_ in each), []
-    for number, where, marker in each:
-        if number:
-            criteria = [asked for asked in (where.get("keep"), keep) if asked is not None]
-            device = None if tracker is None else replace(tracker, marker=marker.tolist())
-            how = cell | where | {"ranges": where.get("ranges", {}) | dict(ranges or {}), "keep": all_of(criteria)}
-            robot = given.robot if model else given
-            draws.append(candidates(robot, -(-count * number // whole), tracker=device, ball=marker, **how))
+    groups += [(1, {"places": torch.cat(held)})] if held else []
+    whole, draws = sum(number for number, _ in groups), []
+    for number, where in groups:
+        marker = markers[-1] if "places" in where else markers.mean(0)
+        device = None if tracker is None else replace(tracker, marker=marker.tolist())
+        how = cell | {"ranges": where.get("ranges", {}) | dict(cell.get("ranges") or {}), "places": where.get("places")}
+        criteria = all_of([asked for asked in (where.get("keep"), keep) if asked is not None])
+        draws.append(candidates(robot, -(-count * number // whole), tracker=device, ball=marker, keep=criteria, **how))
     return torch.cat(draws)
 
 
-def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
-    """Refuse arguments of a robot with a model, and of a model with a robot."""
+def _checked(given: object, of_robots: dict[str, object], free: str | None) -> Tree:
+    """The robot; refuses what is none, arguments of a robot with a model, and of a model with a robot."""
     if isinstance(given, Tree):
         if free is not None:
             fix = "leave it out: of a robot without a model the place of base and markers is not known anyway"
@@ -322,12 +302,15 @@ def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, ob
         scales = of_robots["hyperparameters"]
         if not (scales is None or isinstance(scales, Hyperparameters)):
             raise InputError.of("`hyperparameters`", expected="dc.Hyperparameters", got=type(scales).__name__)
-        return
-    for name, value in of_robots.items():
-        if value is not None:
-            raise InputError.of(f"`{name}` belongs to a robot", got="a model, which has its own", fix="leave it out")
-    if free is not None and (not isinstance(free, str) or free not in FREE):
-        raise InputError.of("`free`", expected=f"None, {', '.join(map(repr, FREE))}", got=as_written(free))
+        return given
+    if not isinstance(given, CalibratedKinematics):
+        expected = "a robot (dc.Tree) or its model (dc.CalibratedKinematics)"
+        raise InputError.of("`robot_or_model`", expected=expected, got=type(given).__name__)
+    for name in (name for name, value in of_robots.items() if value is not None):
+        raise InputError.of(f"`{name}` belongs to a robot", got="a model, which has its own", fix="leave it out")
+    if free not in FREE:
+        raise InputError.of("`free`", expected=", ".join(map(repr, FREE)), got=as_written(free))
+    return given.robot
 
 
 def _configurations(robot: Tree, values: object, name: str) -> Tensor:

@@ -11,8 +11,8 @@ seen: it may hide the board.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from diffeo_calib.calibration.planning.candidates import ranges_around
-from diffeo_calib.calibration.planning.knowledge import Scene, without_positions
+from diffeo_calib.calibration.planning.scene import Scene, View, without_positions
 from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
@@ -36,15 +36,14 @@ from diffeo_calib.sensors.board_camera import BoardCamera
 from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.set_ups import TRANSFORMS, frame_slopes
 
-NEW = -1
-"""Number of an unknown that the scene does not have."""
+NEW = -1  # number of an unknown that the scene does not have
 SMALLEST_REST_M = 1e-6
 
 
-class Told(NamedTuple):
-    """Measurements of one device at O configurations of a scene."""
+class DeviceRows(NamedTuple):
+    """Measurements of one device at O configurations of a view."""
 
-    name: str  # of the device
+    device: str
     rows: Tensor  # (O,) numbers of the configurations
     slopes: Tensor  # (O, r, m) A
     effects: Tensor  # (O, r, k) D
@@ -58,30 +57,26 @@ class Options(NamedTuple):
     rows: Tensor  # (O,) numbers of the configurations
     at: Linearisation  # what they report, with columns by all unknowns
     noise: Tensor  # (O, r, r) m^2
-    device: Tensor  # (O,) numbers of the devices
+    devices: list[str]  # O names
 
     @classmethod
-    def of(cls, scene: Scene, parts: Sequence[Told]) -> Options:
+    def of(cls, scene: Scene, view: View, parts: Sequence[DeviceRows]) -> Options:
         """Join rows of all sensors; what some do not report is noise of 1 m that nothing moves."""
-        r, width, joined = max(part.slopes.shape[1] for part in parts), scene.columns, []
-        for number, part in enumerate(parts):
-            new = part.columns == NEW
-            columns, count = torch.where(new, width - 1 + new.cumsum(0), part.columns), part.slopes.shape[1]
-            width += int(new.sum())
-            if len(part.rows):
-                at = scene.at.rows(part.rows).projected(pad(part.slopes, (0, 0, 0, r - count)))
-                noise = torch.eye(r, dtype=part.noise.dtype, device=part.noise.device).repeat(len(part.rows), 1, 1)
-                noise[:, :count, :count] = part.noise
-                joined.append((part, columns, at, noise, torch.full_like(part.rows, number)))
-        each = []
-        for part, columns, at, _, _ in joined:
-            whole = pad(at.sensitivity, (0, width - at.sensitivity.shape[2]))
-            whole[:, : part.slopes.shape[1]].index_add_(2, columns, part.effects)
-            each.append(replace(at, sensitivity=whole))
-        parts, _, _, noise, device = zip(*joined, strict=True)
-        return cls(
-            torch.cat([part.rows for part in parts]), Linearisation.joined(each), torch.cat(noise), torch.cat(device)
-        )
+        r, first, ats, noises = max(part.slopes.shape[1] for part in parts), scene.columns, [], []
+        width = first + sum(int((part.columns == NEW).sum()) for part in parts)
+        for part in parts:
+            new, (count, size) = part.columns == NEW, part.slopes.shape[:2]
+            columns = torch.where(new, first - 1 + new.cumsum(0), part.columns)
+            first += int(new.sum())
+            if count:
+                at = view.at.rows(part.rows).projected(pad(part.slopes, (0, 0, 0, r - size)))
+                S = pad(at.sensitivity, (0, width - at.sensitivity.shape[2]))
+                S[:, :size].index_add_(2, columns, part.effects)
+                ats.append(replace(at, sensitivity=S))
+                noises.append(torch.eye(r, dtype=S.dtype, device=S.device).repeat(count, 1, 1))
+                noises[-1][:, :size, :size] = part.noise
+        rows, names = torch.cat([part.rows for part in parts]), [part.device for part in parts for _ in part.rows]
+        return cls(rows, Linearisation.joined(ats), torch.cat(noises), names)
 
 
 @dataclass(frozen=True)
@@ -135,8 +130,8 @@ class Sensor(ABC):
         return DeviceReadings.of("socket", places, std)
 
     @abstractmethod
-    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
-        """What each of its devices can measure among some configurations (M',) of a scene."""
+    def measured(self, scene: Scene, view: View) -> Iterator[DeviceRows]:
+        """What each of its devices can measure of a view."""
 
     def reached(self, base: Tensor) -> dict[str, Any]:
         """Where it can measure, as arguments of :func:`candidates`; none if that is not known before, or anywhere.
@@ -163,26 +158,31 @@ class Positions(Sensor):
 
     of_positions: ClassVar[bool] = True
 
-    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+    def measured(self, scene: Scene, view: View) -> Iterator[DeviceRows]:
         """At every configuration. The place of the device is unknown where it is new, or nothing shows the robot's."""
         if self.of_frames and not scene.framed:
             fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
             raise InputError.of("poses of a robot that is known by markers", expected="measured frames", fix=fix)
-        every = torch.eye(scene.points.shape[1], dtype=scene.points.dtype, device=scene.points.device)
-        A = (every if self.of_frames else scene.averaged[: scene.seen]).expand(len(among), -1, -1)
-        points, numbers = scene.points.unflatten(1, (-1, 3)), 6 * (scene.free or scene.unplaced)
-        moved = A @ (PLACES.found_m_rad * frame_slopes(points[among], points.mean((0, 1))))[..., :numbers]
-        noise, columns = self._noise(A @ scene.noise[among] @ A.mT), among.new_full((numbers,), NEW)
-        yield Told("poses" if self.of_frames else "positions", among, A, moved, columns, noise)
+        every = torch.eye(view.points.shape[1], dtype=view.points.dtype, device=view.points.device)
+        A = (every if self.of_frames else scene.averaged[: scene.seen]).expand(len(view.points), -1, -1)
+        points, numbers = view.points.unflatten(1, (-1, 3)), 6 * (scene.free or scene.unplaced)
+        moved = A @ (PLACES.found_m_rad * frame_slopes(points, points.mean((0, 1))))[..., :numbers]
+        rows, name = torch.arange(len(points), device=A.device), "poses" if self.of_frames else "positions"
+        noise, columns = self._noise(A @ view.noise @ A.mT), rows.new_full((numbers,), NEW)
+        yield DeviceRows(name, rows, A, moved, columns, noise)
 
 
 @dataclass(frozen=True)
 class DeviceReadings(Sensor):
-    """Readings of the ball, or of a frame, of one kind."""
+    """Readings of the ball, or of a frame, of one kind.
 
-    names: tuple[str, ...] = ()
-    devices: tuple[FittedDevice, ...] = ()  # each of them, new ones with the deviations of their prior
-    new: bool = True  # whether they are in the robot's base frame, not in that of the model's positions
+    Args:
+        devices: each by its name, new ones with the deviations of their prior.
+        new: whether they are in the robot's base frame, not in that of the model's positions.
+    """
+
+    devices: Mapping[str, FittedDevice] = field(default_factory=dict)
+    new: bool = True
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -194,39 +194,41 @@ class DeviceReadings(Sensor):
         if not bool(constants.isfinite().all()):
             expected = f"{family.stated_as} with a direction"
             raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
-        names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
-        prior = constants.new_tensor(family.prior(offset_std))
+        names, prior = (
+            [f"{kind} {number}" for number in range(1, len(given) + 1)],
+            given.new_tensor(family.prior(offset_std)),
+        )
         devices = (family((name,), each[None], prior[None]) for name, each in zip(names, constants, strict=True))
-        return cls(std, names=names, devices=tuple(FittedDevice(device, torch.diag(prior)) for device in devices))
+        return cls(std, devices={device.names[0]: FittedDevice(device, torch.diag(prior)) for device in devices})
 
     def sentences(self) -> list[str]:
         """One for each."""
-        return [f"{name}: {device.devices.where(0)}" for name, device in zip(self.names, self.devices, strict=True)]
+        return [f"{name}: {device.devices.where(0)}" for name, device in self.devices.items()]
 
     def reached(self, base: Tensor) -> dict[str, Any]:
         """Where the ball must be brought."""
-        held = torch.cat([device.devices.places for device in self.devices])
+        held = torch.cat([device.devices.places for device in self.devices.values()])
         held = held if self.new else (held - base[:3, 3]) @ base[:3, :3]
         return {"places": held} if len(held) else {}
 
-    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+    def measured(self, scene: Scene, view: View) -> Iterator[DeviceRows]:
         """Every device at the configurations in which it sees the tool: the ball, or the last measured frames."""
         base = scene.base if self.new else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
-        whole = torch.eye(scene.points.shape[1], dtype=base.dtype, device=base.device)
-        for name, gauge in zip(self.names, self.devices, strict=True):
-            count = gauge.devices.seen_points
+        whole = torch.eye(view.points.shape[1], dtype=base.dtype, device=base.device)
+        for name, device in self.devices.items():
+            count = device.devices.seen_points
             last = scene.averaged[-3:] if count == 1 else whole[-3 * count :]
-            points = ((scene.points[among] @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]) @ base[:3, :3]
-            points, device = points.flatten(1), torch.zeros_like(among)
-            there = gauge.devices.sees(points, device)
-            points, rows = points[there], among[there]
-            to_seen = torch.block_diag(*[base[:3, :3].mT] * count) @ last
-            A, effects = gauge.devices.observation(device[there]).slope(points) @ to_seen, gauge.by_increments(points)
-            usual = A @ scene.noise[rows] @ A.mT if gauge.noise is None else gauge.noise.expand(len(rows), -1, -1)
-            columns = among.new_full((gauge.root.shape[1],), NEW)
-            if gauge.columns is not None:
-                columns = len(scene.at.spec.prior_variance) + gauge.columns.nonzero()[:, 0]
-            yield Told(name, rows, A, effects @ gauge.root, columns, self._noise(usual))
+            points = (((view.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]) @ base[:3, :3]).flatten(1)
+            number = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+            rows = device.devices.sees(points, number).nonzero()[:, 0]
+            points, to_seen = points[rows], torch.block_diag(*[base[:3, :3].mT] * count) @ last
+            A = device.devices.observation(number[rows]).slope(points) @ to_seen
+            usual = A @ view.noise[rows] @ A.mT if device.noise is None else device.noise.expand(len(rows), -1, -1)
+            columns = rows.new_full((device.root.shape[1],), NEW)
+            if device.columns is not None:
+                columns = len(view.at.spec.prior_variance) + device.columns.nonzero()[:, 0]
+            effects = device.by_increments(points) @ device.root
+            yield DeviceRows(name, rows, A, effects, columns, self._noise(usual))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -235,7 +237,7 @@ class BoardImages(Sensor):
 
     model: CalibratedKinematics
     name: str  # of the camera
-    seen: BoardCamera  # lens, board and what its images showed
+    camera: BoardCamera  # lens, board and what its images showed
     set_up: SetUp  # of its last session
     rows: Tensor  # (M,) of the fit in that session
 
@@ -245,16 +247,15 @@ class BoardImages(Sensor):
 
         Where no row says it, in its last set-up, by a recalibration; in the model's place where it was registered.
         """
-        fields: Any = {"model": model, "name": name, "seen": camera}
         sets = [group for group in model.placement if group.kind in TRANSFORMS and model.registration is None]
+        session = next((word for group in sets for word in reversed(group.names) if word.split("/")[0] == name), None)
         for group in sets:
             here = torch.isin(group.rows, rows)
             if bool(here.any()):
                 number = int(group.device[here][group.rows[here].argmax()])
-                rows = rows[torch.isin(rows, group.rows[group.device == number])]
-                return cls(**fields, set_up=SetUp.of(model, group.names[number]), rows=rows)
-        names = (word for group in sets for word in reversed(group.names) if word.partition("/")[0] == name)
-        return cls(**fields, set_up=SetUp.of(model, next(names, None)), rows=rows)
+                session, rows = group.names[number], rows[torch.isin(rows, group.rows[group.device == number])]
+                break
+        return cls(model=model, name=name, camera=camera, set_up=SetUp.of(model, session), rows=rows)
 
     @cached_property
     def lens(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -263,10 +264,8 @@ class BoardImages(Sensor):
         The unknowns are the shifts of the fit; new ones beside a registration, and for images that its poses do not
         explain. The noise is that of a pose beyond that of its corners, m^2.
         """
-        fitted, rows, root = self.model.map, self.rows, self.seen.camera.root
+        fitted, rows, root = self.model.map, self.rows, self.camera.camera.root
         little = SMALLEST_REST_M**2 * torch.eye(9, dtype=root.dtype, device=root.device)
-        if self.seen.camera.view is None:  # of earlier versions
-            return root[:, :0], rows[:0], little
         new = root, torch.full_like(root[0], NEW, dtype=torch.int64), little
         if self.model.registration is not None or not len(rows):
             return new
@@ -285,38 +284,38 @@ class BoardImages(Sensor):
     def boards(self, points: Tensor) -> Tensor:
         """Poses (M, 4, 4) of the board in the camera's frame by the model's points (M, 9), m."""
         poses = self.set_up.view(poses_from_marks(points.unflatten(1, (3, 3)), self.model.bodies.pose_lever()))
-        return inverse_poses(poses) if self.seen.on_tool else poses
+        return inverse_poses(poses) if self.camera.on_tool else poses
 
     def reached(self, base: Tensor) -> dict[str, Any]:
         """By the rigid kinematics, which is quick, and not far beyond the joints of the fit."""
-        geometry, ranges = self.model.geometry, ranges_around(self.model.robot, self.model.configurations)
-        return {"keep": lambda q: sees(self.seen.camera, self.boards(geometry.points(q).flatten(1))), "ranges": ranges}
+        camera, geometry = self.camera.camera, self.model.geometry
+        ranges = ranges_around(self.model.robot, self.model.configurations)
+        return {"keep": lambda q: sees(camera, self.boards(geometry.points(q).flatten(1))), "ranges": ranges}
 
     def tells(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
         boards, lever = self.boards(points), self.model.bodies.pose_lever()
-        covariance, effects = expected(self.seen.camera, boards)
+        covariance, effects = expected(self.camera.camera, boards)
         tool, turn, board = poses_from_marks(points.unflatten(1, (3, 3)), lever), self.set_up.transform[:3, :3].mT, None
-        if self.seen.on_tool:
+        if self.camera.on_tool:
             M = self.set_up.mount
             turn, board = M[:3, :3], boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
             tool = inverse_poses(M @ boards)
         slopes = pose_jacobian(tool[:, None], lever, board)[:, 0] @ torch.block_diag(turn, turn)
         return slopes @ covariance @ slopes.mT, slopes @ effects
 
-    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+    def measured(self, scene: Scene, view: View) -> Iterator[DeviceRows]:
         """Where the camera sees the board."""
-        rows, (root, columns, rest) = among[sees(self.seen.camera, self.boards(scene.points[among]))], self.lens
-        points, noise = scene.points[rows], scene.noise[rows]
-        parts = [(columns, noise.new_zeros(len(rows), 9, 0))]
-        if self.seen.camera.view is not None:
-            noise, by_lens = self.tells(points)
-            noise, parts = noise + rest, [(columns, by_lens @ root)]
-        first = len(scene.at.spec.prior_variance)
-        parts.append((first + self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points)))
-        columns, effects = torch.cat([numbers for numbers, _ in parts]), torch.cat([moves for _, moves in parts], 2)
+        camera, first = self.camera.camera, len(view.at.spec.prior_variance)
+        rows = sees(camera, self.boards(view.points)).nonzero()[:, 0]
+        points, noise = view.points[rows], view.noise[rows]
+        effects = [self.set_up.shifted(points)]
+        columns = [first + self.set_up.columns.nonzero()[:, 0]]
+        if camera.view is not None:  # which files of earlier versions do not have
+            (root, by_lens, rest), (noise, slopes) = self.lens, self.tells(points)
+            noise, effects, columns = noise + rest, [slopes @ root, *effects], [by_lens, *columns]
         every = torch.eye(9, dtype=points.dtype, device=points.device).expand(len(rows), 9, 9)
-        yield Told(self.name, rows, every, effects, columns, self._noise(noise))
+        yield DeviceRows(self.name, rows, every, torch.cat(effects, 2), torch.cat(columns), self._noise(noise))
 
 
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
@@ -326,14 +325,14 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
         InputError: files of early versions, which do not say where devices of readings are.
     """
     sensors: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
-    for kit in model.placement:
-        for k, (name, camera) in enumerate(kit.cameras.items()):
-            sensors.append(BoardImages.last(model, name, camera, kit.rows[kit.device == k]))
-    words = [word for kit in model.placement for word in kit.names]
-    for kit in model.placement:
-        for number, word in enumerate(kit.names if kit.seen_points else ()):
-            name = f"{kit.kind} {word}" if words.count(word) > 1 else word
-            sensors.append(DeviceReadings(names=(name,), devices=(FittedDevice.of(model.map, kit, number),), new=False))
+    for group in model.placement:
+        for k, (name, camera) in enumerate(group.cameras.items()):
+            sensors.append(BoardImages.last(model, name, camera, group.rows[group.device == k]))
+    words = [word for group in model.placement for word in group.names]
+    for group in model.placement:
+        for number, word in enumerate(group.names if group.seen_points else ()):
+            name = f"{group.kind} {word}" if words.count(word) > 1 else word
+            sensors.append(DeviceReadings(devices={name: FittedDevice.of(model.map, group, number)}, new=False))
     if not sensors:
         fix = "say by `sensor` what will measure"
         raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)

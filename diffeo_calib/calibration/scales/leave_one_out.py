@@ -233,11 +233,7 @@ def inflation_by_places(
 
 
 def inflation_by_parts(data: TangentData, scales: Hyperparameters, seed: int = 0) -> float:
-    """Inflation of a field by parts of the space of inputs that are left out, scales kept.
-
-    Args:
-        data: the measurements. scales: held fixed. seed: draws the rows that stand for all where there are many.
-    """
+    """Inflation of a field by parts of the space of inputs that are left out, scales kept; ``seed`` draws some rows."""
     data = data.sample(len(data.x), MOST_COORDINATES, seed)[1]
     process = data.process(scales)
     part = halved(data.x)[process.numbers.owner]

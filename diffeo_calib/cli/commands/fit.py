@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,6 @@ import typer
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, check_errors, contradicted, outlier_lines
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
-from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
@@ -69,12 +68,11 @@ def run(given: FitOptions) -> None:
     say(*_verdict(result, judged))
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
-    wrong = list[Outlier]()
+    wrong: Sequence[Outlier] = ()
     if test is not None:
         measured = positions_of(result.model, result.places(), test)
-        wrong += contradicted_in_sockets(result.model, test)
-        wrong += [] if measured is None else contradicted(result.model, measured)
-        say(*outlier_lines(sorted(wrong, key=lambda outlier: -outlier.distance), len(test), "held-out rows"))
+        wrong = [] if measured is None else contradicted(result.model, measured)
+        say(*outlier_lines(wrong, len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
-from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
+from diffeo_calib.calibration.planning.scene import MARKER
 from diffeo_calib.calibration.planning.sensors import Sensor, sensors_for
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions

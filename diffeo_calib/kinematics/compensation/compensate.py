@@ -1,8 +1,6 @@
 """Joint commands that bring the tool of a calibrated robot to its targets.
 
-Rows that follow each other: corrections that change slowly, and commands that start at the row before.
-
-Rows are first corrected on their own, all at once. Where corrections c then change faster than the rate r, they are
+Rows are corrected on their own, all at once. Where corrections c of a path then change faster than the rate r, they are
 replaced by the mean of their two envelopes,
 
     1/2 min_j (c_j + r |t_j - t_i|) + 1/2 max_j (c_j - r |t_j - t_i|),
@@ -29,28 +27,25 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.problem import (
-    CODE,
-    MEMBERS,
     SLIDE_BOUND,
     TURN_BOUND,
+    Box,
     CompensationProblem,
     Solution,
     Status,
+    box_search,
     by_joint,
     joint_limits,
     mobilities,
+    reached,
 )
-from diffeo_calib.kinematics.compensation.search import Box, box_search, reached
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, checked_targets, finite_rows, tool_functions
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 
-BOUND_FACTOR_BETWEEN_ROWS = 10.0
-"""Default bounds where rows start at the row before, in units of the usual ones."""
 LEAST_DIRECTION = 1e-3
 """Motion of a tool in a direction, as a share of its largest one, below which slides do not move it there."""
-ROWS_PER_BOUND = 0.1
-"""Default rate of a path without times, in bounds per row."""
+ROWS_PER_BOUND = 0.1  # default rate of a path without times, in bounds per row
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,7 +137,7 @@ def compensate(
             all T tips at once, in the order of ``robot.tips``, are (N, T, 4, 4) or (N, T, 3), NaN where a tip may be
             anywhere.
         start: (N, n) commands to correct, rad or m: the nominal inverse kinematics of each target. The result stays on
-            its branch. Or (n,) for the first row alone: every other row starts at the command of the row before.
+            its branch.
         axis: (N, 3) or (N, T, 3) directions, of any length, in which one axis of the tool shall point, beside
             positions; the turn about it is free.
         tool_axis: that axis of the tool's frame: "x", "y" or "z".
@@ -150,7 +145,7 @@ def compensate(
             targets of all tips (T, 4, 4) or (T, 3).
         frame: frame of the targets, "base" or "measuring".
         bound: largest motion of a joint away from its start: one number in rad for all turning joints, or one for each
-            joint in rad or m. Default 1 degree, 0.02 m if prismatic; ten times that where rows start at the row before.
+            joint in rad or m. Default 1 degree, 0.02 m if prismatic.
         limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
             limit is brought back if the bound allows it.
         weights: (n,) cost of each joint's motion per rad^2 or m^2, in units of the smallest, where a redundant robot
@@ -177,34 +172,26 @@ def compensate(
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     check_number(lever, "`lever`", above=0.0)
     wanted, robot = real_tensor(targets, "targets"), model.robot
-    fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
+    fix = "pass the joints of `robot.joint_names`, one row per target"
     given = real_tensor(named_columns(start, robot.joint_names, "start"), "start")
-    following = given.ndim == 1 and wanted.ndim > 1  # every other row starts at the command of the row before
-    begin = finite_rows(given, "start", (robot.n,) if following else ("N", robot.n), fix)
-    begin = np.tile(begin, (len(wanted), 1)) if following else begin
+    begin = finite_rows(given, "start", ("N", robot.n), fix)
     goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     functions = tool_functions(model, tools, frame)
     if not any(robot.periodic):
         v = functions.rough(np.zeros((1, robot.n)))[0, :, :3]
         goals = replace(goals, along=v @ np.linalg.pinv(v, rcond=LEAST_DIRECTION))
-    factor = BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0
-    usual = factor * np.where(robot.periodic, TURN_BOUND, SLIDE_BOUND)
-    motion = by_joint(robot, bound, "bound", usual)
+    motion = by_joint(robot, bound, "bound", np.where(robot.periodic, TURN_BOUND, SLIDE_BOUND))
     mobility = mobilities(robot, weights, tuple(tools), ~goals.free)
     problem = CompensationProblem(functions, goals, begin, joint_limits(robot, limits), motion, mobility)
-    pace = _pace(robot, problem, rate, time, path=path and not following)
-    if following:
-        return _result(*follow(problem, begin[0] if len(begin) else motion))
+    pace = _pace(robot, problem, rate, time, path=path)
     if pace is None:
         return _result(problem, problem.solve())
     solution, jumps = solve_path(problem, pace)
     if len(jumps):
-        rows = (
-            f"the corrections of the path jump after {few(jumps.tolist())} rows, and were spread over the rows around"
-        )
+        rows = f"{few(jumps.tolist())} rows, and were spread over the rows around"
         fix = "look at their statuses: the path may pass a singularity or change its branch there"
-        warn_user(sentence(rows, fix=fix))
+        warn_user(sentence(f"the corrections of the path jump after {rows}", fix=fix))
     return _result(problem, solution, jumps)
 
 
@@ -239,8 +226,7 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
     if not goals.of_tips:
         return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}
     if tool is None:
-        usual = model.tool_tip or tips[0]
-        return {tip: model.tool if tip == usual else tool_transform(None) for tip in tips}
+        return {tip: tool_transform(None) for tip in tips} | {model.tool_tip or tips[0]: model.tool}
     given = real_tensor(tool, "tool")
     if given.shape not in ((len(tips), 4, 4), (len(tips), 3)):
         expected, fix = f"({len(tips)}, 4, 4) or ({len(tips)}, 3)", "pass one tool for every tip"
@@ -249,7 +235,7 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
 
 
 def _result(problem: CompensationProblem, solution: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
-    goals, status = problem.targets, tuple(MEMBERS[code] for code in solution.codes.tolist())
+    goals, status = problem.targets, tuple(map(Status, solution.status.tolist()))
     (miss, angle), poses = goals.misses(solution.poses), solution.poses
     miss, angle = np.where(goals.free, np.nan, miss), None if angle is None else np.where(goals.free, np.nan, angle)
     if not goals.of_tips:
@@ -260,8 +246,7 @@ def _result(problem: CompensationProblem, solution: Solution, jumps: Sequence[in
 
 
 ROUNDS = 3
-SAME_CORRECTION_TOLERANCE = 1e-9
-"""Corrections that differ by more than this, rad or m, are not the same."""
+SAME_CORRECTION_TOLERANCE = 1e-9  # corrections that differ by more than this, rad or m, are not the same
 
 ROUNDING = 1e-14
 
@@ -302,15 +287,14 @@ def _lowest(values: Array, steps: Array) -> Array:
 
 def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Array]:
     """Commands of a path, and the rows at which the corrections of the rows on their own jump."""
-    solution = problem.solve()
-    start = problem.start
+    solution, start = problem.solve(), problem.start
     jumps = pace.jumps(solution.q - start)
-    firm = solution.codes == CODE[Status.reached]
+    firm = solution.status == Status.reached.value
     q, held = solution.q.copy(), np.zeros(solution.q.shape, dtype=bool)
     for _ in range(ROUNDS):
         slow = start + pace.limited(q - start, firm)
-        held |= np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
-        rows = np.flatnonzero((np.abs(slow - q) > SAME_CORRECTION_TOLERANCE).any(1))
+        changed = np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
+        held, rows = held | changed, np.flatnonzero(changed.any(1))
         if not len(rows):
             break
         part, still = problem.started(rows, start[rows]), held[rows]
@@ -326,24 +310,12 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
 
 def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solution:
     """Poses and statuses of the commands that differ from those of the rows on their own."""
-    rows = np.flatnonzero((np.abs(q - before.q) > 0).any(1))
-    poses, codes = before.poses.copy(), before.codes.copy()
+    rows = np.flatnonzero((q != before.q).any(1) & np.isfinite(q).all(1))
+    poses, status = before.poses.copy(), before.status.copy()
     if len(rows):
         poses[rows] = problem.tool.poses(q[rows])
         there = reached(problem.targets.take(rows), poses[rows])
         slowed = (np.abs(q[rows] - before.q[rows]) > SAME_CORRECTION_TOLERANCE).any(1)
-        codes[rows[there]] = CODE[Status.reached]
-        codes[rows[~there & slowed]] = CODE[Status.rate]
-    return Solution(q, poses, codes)
-
-
-def follow(problem: CompensationProblem, first: Array) -> tuple[CompensationProblem, Solution]:
-    """The problem whose rows start at the command of the row before, the first at ``first`` (n,), and its solution."""
-    rows, at = [], first
-    starts = np.empty((len(problem.targets), len(first)))
-    for row in range(len(starts)):
-        starts[row] = at
-        rows.append(problem.started(np.array([row]), at[None]).solve())
-        at = rows[-1].q[0] if np.isfinite(rows[-1].q).all() else at
-    solution = Solution(*(np.concatenate(parts) for parts in zip(*rows, strict=True))) if rows else problem.solve()
-    return problem.started(np.arange(len(starts)), starts), solution
+        status[rows[there]] = Status.reached.value
+        status[rows[~there & slowed]] = Status.rate.value
+    return Solution(q, poses, status)

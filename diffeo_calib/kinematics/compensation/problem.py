@@ -1,6 +1,16 @@
-"""All rows of a compensation as arrays, where their joints may be, and their solution.
+"""The nearest command that the joints of every row allow, and why a target is not reached.
 
-Why a target is not reached: the limit of a joint, a singularity, or because it is out of reach.
+Minimises
+
+    F(q) = f(q) + MOTION_COST / 2 |q - start|_W^2     over low <= q <= high,
+
+f from the targets, W the inverse mobilities. The second term is worth less than 0.2 um for a motion of a degree: it
+decides between commands that are equally good. Newton steps in a trust region (Levenberg and Marquardt; K. Madsen,
+H. Nielsen, O. Tingleff, "Methods for non-linear least squares problems", 2004), each the minimum of its quadratic
+model in the box. A calibrated robot differs from its geometric model by about 1e-3, so that steps with the geometric
+Jacobian, which is quick, contract the error by 100 each: they come first, the exact Hessian where they do not suffice.
+
+A target is not reached because of the limit of a joint, a singularity, or because it is out of reach.
 """
 
 from __future__ import annotations
@@ -15,16 +25,191 @@ import numpy as np
 
 from diffeo_calib.common.checks import positive, real_tensor
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.search import Box, box_search
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, ToolFunctions
 from diffeo_calib.robots.tree import Tree
 
-TURN_BOUND = radians(1.0)
-"""Default bound of a correction of a turning joint, rad."""
-SLIDE_BOUND = 0.02
-"""Default bound of a correction of a slide, m."""
-LIMIT_SLACK = 1e-9
-"""Starts beyond a limit by less than this, rad or m, come from rounding."""
+REACHED_MISS = 5e-10  # miss in m and rad at which a row counts as reached: half of what is promised
+MOTION_COST = 1e-10  # m^2 per rad^2 (or per m^2 of a slide)
+LEAST_MOBILITY = 1e-9
+QUICK_STEPS, MOST_NEWTON_STEPS, LAST_STEPS = 6, 100, 2
+SLOWEST_CONTRACTION = 0.1
+"""A quick step must leave less than this fraction of the squared miss, which motion has no part in."""
+SETTLED_STEP = 1e-12  # no joint moves by more than this any more, rad or m
+NEAR_TARGET_M = 1e-4  # errors below this, in m, are worth a last search for the target itself
+LEAST_DAMPING, START_DAMPING = 1e-12, 1e-9
+ROUNDING = 1e-15
+SMALLEST_GAIN = 1e-20  # steps that promise less than this, in m^2, are the last
+
+
+@dataclass(eq=False)
+class Box:
+    """Where the joints may be, and what their motion costs."""
+
+    start: Array  # (N, n) commands before the correction, rad or m
+    low: Array  # (N, n) what the joints' limits and the bound of motion leave, to high
+    high: Array
+    mobility: Array  # (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move
+
+    def take(self, rows: Array) -> Box:
+        """The boxes of some rows."""
+        return Box(self.start[rows], self.low[rows], self.high[rows], self.mobility[rows])
+
+
+def reached(targets: Targets, poses: Array) -> Array:
+    """(N,) whether each tool is at its target."""
+    distance, angle = targets.misses(poses)
+    return np.all((distance if angle is None else np.maximum(distance, angle)) <= REACHED_MISS, axis=1)
+
+
+def box_search(tool: ToolFunctions, targets: Targets, q: Array, box: Box) -> tuple[Array, Array, Array]:
+    """Search the nearest point of every row.
+
+    Args:
+        tool: the kinematics. targets: N targets. q: (N, n) where to start, inside the box.
+
+    Returns:
+        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
+    """
+    search = Search(tool, targets, q, box)
+    for exact, most in ((False, QUICK_STEPS), (True, MOST_NEWTON_STEPS)):
+        search.begin(exact=exact)
+        for _ in range(most):
+            if not len(search.todo):
+                break
+            search.step()
+        search.finish()
+    return search.q, search.poses, reached(targets, search.poses)
+
+
+class Search:
+    """State of all rows; ``todo`` are those that still move."""
+
+    def __init__(self, tool: ToolFunctions, targets: Targets, q: Array, box: Box) -> None:
+        held = box.mobility <= 0
+        box = replace(box, low=np.where(held, q, box.low), high=np.where(held, q, box.high))
+        self.tool, self.targets, self.box = tool, targets, box
+        self.q, self.poses = q.copy(), tool.poses(q)
+        count, n = q.shape
+        self.pull = MOTION_COST / np.maximum(box.mobility, LEAST_MOBILITY)  # (N, n)
+        self.cost = self._cost(np.arange(count), q, self.poses)
+        self.gradient, self.hessian = np.empty((count, n)), np.empty((count, n, n))
+
+    def begin(self, *, exact: bool) -> None:
+        """Start with the rows that are not there, with the exact Hessian or with the quick one."""
+        self.exact, count = exact, len(self.q)
+        self.damping, self.growth = np.full(count, START_DAMPING), np.full(count, 2.0)
+        self.todo = np.flatnonzero(~reached(self.targets, self.poses))
+        self._linearise(self.todo)
+
+    def step(self) -> None:
+        """One step of every row that still moves."""
+        rows, box = self.todo, self.box.take(self.todo)
+        weights = self.pull[rows] / MOTION_COST
+        damped = self.hessian[rows] + (self.damping[rows, None] * weights)[:, :, None] * np.eye(self.q.shape[1])
+        at, slope = self.q[rows], self.gradient[rows]
+        step = _step_in_box(damped, slope, box.low - at, box.high - at)
+        moved = np.clip(at + step, box.low, box.high)
+        poses = self.tool.poses(moved)
+        cost = self._cost(rows, moved, poses)
+        goal, before = self.targets.take(rows), self.cost[rows]
+        missed = goal.cost(self.poses[rows])
+        noise = ROUNDING * before
+        promised = -np.einsum("ni,ni->n", slope + 0.5 * (damped @ step[:, :, None])[:, :, 0], step)
+        gain = (before - cost + noise) / (np.abs(promised) + noise + 1e-300)
+        good = gain > 1e-4
+        taken = rows[good]
+        self.q[taken], self.poses[taken], self.cost[taken] = moved[good], poses[good], cost[good]
+        damping, growth = self.damping[rows], self.growth[rows]  # by Nielsen's rule
+        factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain, 1.0) - 1.0) ** 3)
+        self.damping[rows] = np.maximum(np.where(good, damping * factor, damping * growth), LEAST_DAMPING)
+        self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
+        still = np.abs(step).max(1, initial=0.0) <= SETTLED_STEP
+        still |= np.abs(promised) <= np.maximum(SMALLEST_GAIN, noise)
+        still |= good & reached(goal, poses)
+        if not self.exact:
+            still |= goal.cost(poses) > SLOWEST_CONTRACTION * missed
+        self._linearise(rows[good & ~still])
+        self.todo = rows[~still]
+
+    def _linearise(self, rows: Array) -> None:
+        """Gradient, and the Hessian made positive definite."""
+        if not len(rows):
+            return
+        targets, poses, pull, box = self.targets.take(rows), self.poses[rows], self.pull[rows], self.box.take(rows)
+        q = self.q[rows]
+        jacobian = self.tool.jacobian(q) if self.exact else self.tool.rough(q)
+        slopes = targets.slopes(jacobian)
+        slope = pull * (q - box.start) - (slopes.swapaxes(1, 2) @ targets.errors(poses)[:, :, None])[:, :, 0]
+        hessian = slopes.swapaxes(1, 2) @ slopes + pull[:, :, None] * np.eye(pull.shape[1])
+        if self.exact:
+            if self.tool.serial:
+                hessian = hessian + targets.curvature(jacobian, poses)
+            blocked = ((q <= box.low) & (slope > 0)) | ((q >= box.high) & (slope < 0))
+            hessian = _convex(hessian, blocked)
+        self.gradient[rows], self.hessian[rows] = slope, hessian
+
+    def _cost(self, rows: Array, q: Array, poses: Array) -> Array:
+        away = q - self.box.start[rows]
+        return self.targets.take(rows).cost(poses) + 0.5 * (self.pull[rows] * away * away).sum(1)
+
+    def finish(self) -> None:
+        """The cost of motion keeps rows a little away from their targets: go there with the joints that are free."""
+        near = np.linalg.norm(self.targets.errors(self.poses), axis=1) < NEAR_TARGET_M
+        rows = np.flatnonzero(near & ~reached(self.targets, self.poses))
+        if not len(rows):
+            return
+        goal, box, q, poses = self.targets.take(rows), self.box.take(rows), self.q[rows], self.poses[rows]
+        jacobian, ease = (
+            self.tool.jacobian if self.exact else self.tool.rough,
+            np.sqrt(box.mobility) * ((q > box.low) & (q < box.high)),
+        )
+        for _ in range(LAST_STEPS):
+            inverse = ease[:, :, None] * np.linalg.pinv(goal.slopes(jacobian(q)) * ease[:, None])
+            q = np.clip(q + (inverse @ goal.errors(poses)[:, :, None])[:, :, 0], box.low, box.high)
+            poses = self.tool.poses(q)
+            there = reached(goal, poses)
+            if there.all():
+                break
+        self.q[rows[there]], self.poses[rows[there]] = q[there], poses[there]
+
+
+def _convex(hessian: Array, blocked: Array) -> Array:
+    """Hessians (N, n, n) with their negative curvatures reversed, each joint that its box holds (N, n) on its own."""
+    apart = blocked[:, :, None] | blocked[:, None, :]
+    diagonal = np.abs(np.einsum("nii->ni", hessian)) + MOTION_COST
+    split = np.where(apart, diagonal[:, :, None] * np.eye(hessian.shape[1]), hessian)
+    values, vectors = np.linalg.eigh(split)
+    bent = np.flatnonzero(values[:, 0] < MOTION_COST)
+    if len(bent):
+        sizes = np.maximum(np.abs(values[bent]), MOTION_COST)
+        split[bent] = (vectors[bent] * sizes[:, None, :]) @ vectors[bent].swapaxes(1, 2)
+    return split
+
+
+def _step_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """(N, n) minimum of 1/2 s^T H s + g^T s in a box: all joints change to the end that they lead to, or away from it.
+
+    After n such steps one joint at a time, with which the search ends (J. Judice, F. Pires, "A block principal pivoting
+    algorithm for large-scale strictly monotone linear complementarity problems", 1994).
+    """
+    n, held, side = g.shape[1], low >= high, np.zeros(g.shape, dtype=np.int64)
+    for turn in range(5 * n):
+        free = (side == 0) & ~held
+        s = np.where(free, 0.0, np.where(side > 0, high, low))
+        reduced = H * (free[:, :, None] & free[:, None, :]) + ~free[:, :, None] * np.eye(n)
+        s -= np.linalg.solve(reduced, ((g + (H @ s[:, :, None])[:, :, 0]) * free)[:, :, None])[:, :, 0]
+        wish = s - (g + (H @ s[:, :, None])[:, :, 0]) / np.einsum("nii->ni", H)
+        wished = np.where(wish > high, 1, np.where(wish < low, -1, 0))
+        wrong = (wished != side) & ~held
+        if not wrong.any():
+            break
+        side = np.where(wrong & ((turn < n) | (wrong.cumsum(1) == 1)), wished, side)
+    return np.clip(s, low, high)
+
+
+TURN_BOUND = radians(1.0)  # default bound of a correction of a turning joint, rad
+SLIDE_BOUND = 0.02  # default bound of a correction of a slide, m
+LIMIT_SLACK = 1e-9  # starts beyond a limit by less than this, rad or m, come from rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +223,16 @@ class Limits:
     most: Array  # (k,)
 
     def within(self, start: Array, q: Array) -> Array:
-        """Commands on the way from ``start`` to ``q`` (N, n) where the mimic joints of several joints stay in limits.
+        """Commands ``q`` (N, n), the start of rows whose mimic joints of several joints would leave their limits there.
 
         NaN where they are beyond their limits at the start already.
         """
-        before, change = start @ self.matrix.T, (q - start) @ self.matrix.T  # (N, k)
-        outside = ((before < self.least - LIMIT_SLACK) | (before > self.most + LIMIT_SLACK)).any(1)
-        end = np.where(change > 0, self.most, self.least)
-        share = np.where(change != 0, (end - before) / np.where(change != 0, change, 1.0), np.inf)
-        share = np.clip(share.min(1, initial=1.0), 0.0, 1.0)
-        kept = np.where((share < 1.0)[:, None], start + share[:, None] * (q - start), q)
-        return np.where(outside[:, None], np.nan, kept)
+
+        def outside(at: Array, slack: float) -> Array:
+            values = at @ self.matrix.T  # (N, k)
+            return ((values < self.least - slack) | (values > self.most + slack)).any(1)[:, None]
+
+        return np.where(outside(start, LIMIT_SLACK), np.nan, np.where(outside(q, 0.0), start, q))
 
 
 def joint_limits(chain: Tree, given: object) -> Limits:
@@ -111,11 +295,11 @@ ROWS_AT_ONCE = 4096
 
 
 class Solution(NamedTuple):
-    """Commands (N, n) in rad or m, poses of the tools (N, T, 4, 4), statuses' codes (N,)."""
+    """Commands (N, n) in rad or m, poses of the tools (N, T, 4, 4), names of statuses (N,)."""
 
     q: Array
     poses: Array
-    codes: Array
+    status: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,44 +329,43 @@ class CompensationProblem:
     def solve(self) -> Solution:
         """The nearest command of every row on its own; none where a start is farther beyond a limit than the bound."""
         count, n = self.start.shape
-        poses = np.full((count, self.targets.tools, 4, 4), np.nan)
-        solution = Solution(np.full((count, n), np.nan), poses, np.full(count, CODE[Status.limit]))
+        poses, status = (
+            np.full((count, self.targets.tools, 4, 4), np.nan),
+            np.full(count, Status.limit.value, dtype="U11"),
+        )
+        solution = Solution(np.full((count, n), np.nan), poses, status)
         box = self.box()
         possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
             begin, (q, reached, done) = self.started(rows, self.start[rows]), self._search(rows)
-            solved = begin.keep_mimics(Solution(q, reached, begin._codes(q, reached, done)))
+            solved = begin.keep_mimics(Solution(q, reached, begin._status(q, reached, done)))
             for whole, part in zip(solution, solved, strict=True):
                 whole[rows] = part
         return solution
 
     def keep_mimics(self, solution: Solution) -> Solution:
-        """Shorten corrections that would take mimic joints of several joints beyond their limits."""
+        """Give up corrections that would take mimic joints of several joints beyond their limits."""
         if not len(self.limits.matrix):
             return solution
         q = self.limits.within(self.start, solution.q)
-        changed = np.flatnonzero((q != solution.q).any(1))
-        poses, codes = solution.poses.copy(), solution.codes.copy()
-        codes[changed] = CODE[Status.limit]
-        possible = changed[np.isfinite(q[changed]).all(1)]
+        poses, changed = solution.poses.copy(), (q != solution.q).any(1)
         poses[changed] = np.nan
+        possible = changed & np.isfinite(q).all(1)
         poses[possible] = self.tool.poses(q[possible])
-        return Solution(q, poses, codes)
+        return Solution(q, poses, np.where(changed, Status.limit.value, solution.status))
 
-    def _codes(self, q: Array, poses: Array, done: Array) -> Array:
-        """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
-        codes = np.where(done, CODE[Status.reached], CODE[Status.unreachable])
-        if done.all():
-            return codes
+    def _status(self, q: Array, poses: Array, done: Array) -> Array:
+        """(N,) names of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
+        status = np.where(done, Status.reached.value, Status.unreachable.value)
         rows = np.flatnonzero(~done)
-        at_limit = ((q[rows] <= self.limits.low) | (q[rows] >= self.limits.high)).any(1)
-        freed = rows[at_limit]
-        freed = freed[self._search(freed, limited=False)[2]]
-        codes[freed] = CODE[Status.limit]
+        freed = rows[((q[rows] <= self.limits.low) | (q[rows] >= self.limits.high)).any(1)]
+        freed = freed[self._search(freed, limited=False)[2]] if len(freed) else freed
+        status[freed] = Status.limit.value
         rest = np.setdiff1d(rows, freed)
-        codes[rest[self._singular(rest, q[rest], poses[rest])]] = CODE[Status.singular]
-        return codes
+        if len(rest):
+            status[rest[self._singular(rest, q[rest], poses[rest])]] = Status.singular.value
+        return status
 
     def _search(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> tuple[Array, Array, Array]:
         """:func:`box_search` of some rows, with or without the limits of the joints, with a multiple of the bound."""
@@ -192,11 +375,13 @@ class CompensationProblem:
     def _singular(self, rows: Array, q: Array, poses: Array) -> Array:
         """(R,) whether a singularity is to blame, at the start or at the nearest command ``q``."""
         start, targets = self.start[rows], self.targets.take(rows)
-        near, open_ = self._blames(targets, start, self.tool.poses(start), start)
-        near_here, open_here = self._blames(targets, q, poses, start)
-        singular = (near & open_) | (near_here & open_here)
-        doubtful = np.flatnonzero((near | near_here) & ~singular)
-        singular[doubtful] = self._search(rows[doubtful], scale=SECOND_SEARCH_BOUND_FACTOR)[2]
+        near, singular = np.zeros((2, len(rows)), dtype=bool)
+        for at, there in ((start, self.tool.poses(start)), (q, poses)):
+            weak, open_ = self._blames(targets, at, there, start)
+            near, singular = near | weak, singular | (weak & open_)
+        doubtful = np.flatnonzero(near & ~singular)
+        if len(doubtful):
+            singular[doubtful] = self._search(rows[doubtful], scale=SECOND_SEARCH_BOUND_FACTOR)[2]
         return singular
 
     def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
@@ -205,24 +390,20 @@ class CompensationProblem:
         Along the direction v of the joints that moves the tool least, the tool goes s t + c t^2 / 2 in the direction u.
         Where that bends back before it has gone as far as the target, the workspace probably ends before it.
         """
-        slopes = self._slopes(targets, q)
+        U, s, Vt = np.linalg.svd(self._slopes(targets, q), full_matrices=False)
         error = targets.errors(poses) * targets.to_metres(self.tool.length)
-        U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
         parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
-        weak = s <= WEAK_DIRECTION_SHARE * s[:, :1]
-        motion = parts / np.maximum(s, 1e-300)
+        weak, motion = s <= WEAK_DIRECTION_SHARE * s[:, :1], parts / np.maximum(s, 1e-300)
         strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.bound
         each, main = np.arange(len(q)), np.where(weak, np.abs(motion), -1.0).argmax(1)
         v, u, far, slope = Vt[each, main], U[each, :, main], parts[each, main], s[each, main]
-        way, speeds = v * self.bound, list[Array]()  # of the joints; of the tool at both sides of q along it
-        for side in (1.0, -1.0):
-            speeds.append((self._slopes(targets, q + side * DIFFERENCE * way) @ v[:, :, None])[:, :, 0])
-        bend = np.einsum("nk,nk->n", u, (speeds[0] - speeds[1]) / (2.0 * DIFFERENCE))
-        ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
-        length = self.tool.length * np.square(way).sum(1)
-        ends &= np.abs(bend) > BENT_WORKSPACE_CURVATURE * length
-        near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
-        return weak.any(1) & near, ~ends
+        way = v * self.bound  # of the joints
+        ahead, behind = (self._slopes(targets, q + step * way) @ v[:, :, None] for step in (DIFFERENCE, -DIFFERENCE))
+        bend = np.einsum("nk,nk->n", u, (ahead - behind)[:, :, 0] / (2.0 * DIFFERENCE))
+        bent = np.abs(bend) > BENT_WORKSPACE_CURVATURE * self.tool.length * np.square(way).sum(1)
+        ends = bent & (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
+        near = weak.any(1) & (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
+        return near, ~ends
 
     def _slopes(self, targets: Targets, q: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
@@ -233,13 +414,8 @@ WEAK_DIRECTION_SHARE = 0.1
 """A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
 BENT_WORKSPACE_CURVATURE = 0.05
 """The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
-SECOND_SEARCH_BOUND_FACTOR = 10.0
-"""Multiple of the bound within which targets beyond the end are searched once more."""
-DIFFERENCE = 1e-4
-"""Step in rad or m of central differences of the Jacobian."""
-
-ROUNDING = 1e-15
-"""Relative; so that the difference of command and start, too, is within the bound."""
+SECOND_SEARCH_BOUND_FACTOR = 10.0  # multiple of the bound within which targets beyond the end are searched once more
+DIFFERENCE = 1e-4  # step in rad or m of central differences of the Jacobian
 
 
 class Status(str, Enum):
@@ -267,7 +443,3 @@ class Status(str, Enum):
 
     def __repr__(self) -> str:
         return repr(self.value)
-
-
-MEMBERS = tuple(Status)
-CODE = {status: code for code, status in enumerate(MEMBERS)}

@@ -229,10 +229,8 @@ def _unit(given: Tensor, count: int, place: Any) -> Array:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-SOME_LENGTH = 0.5
-"""m that a radian counts as where directions of a robot without a finite reach are compared."""
-MOST_TOOLS = 16
-"""Tools of one model that are kept ready."""
+SOME_LENGTH = 0.5  # m that a radian counts as where directions of a robot without a finite reach are compared
+MOST_TOOLS = 16  # tools of one model that are kept ready
 
 
 @dataclass(frozen=True)

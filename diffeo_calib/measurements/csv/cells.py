@@ -1,7 +1,9 @@
-"""Cells and columns of a table. Every mistake is one error that names the file, the line and the column.
+"""Cells of a table as numbers, and of files that are no text: spreadsheets, arrays of NumPy, variables of MATLAB.
 
-This module knows neither units nor robots. Only the wanted columns are read as numbers; other columns may hold
-anything.
+An array (N, k) has a column for each k, named after it and numbered from 1; (N, 3) of an array in a file of several is
+x, y, z where the name is that of places; of poses (N, 4, 4) the columns are numbered by row and column, 00 to 33. Of
+several arrays those with the number of rows that most columns have are the table; (k, N) among them is turned. Two
+sheets are one table if one column of both has the same texts.
 """
 
 from __future__ import annotations
@@ -11,10 +13,16 @@ import difflib
 import io
 import math
 import re
+import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
+from itertools import compress, product, zip_longest
 from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
@@ -143,3 +151,175 @@ def number_hint(text: str, decimal: str) -> str:
     if number(text, other) is not None or number(text, decimal, grouped=True) is not None:
         return f"looks like a decimal {word}: pass decimal={other!r}, or export without marks of thousands"
     return "repair this cell, or name another column"
+
+
+# --- files that are no text
+
+MARKS = ZIP, OLD_SHEET, NUMPY, MATLAB = b"PK\3\4", b"\xd0\xcf\x11\xe0", b"\x93NUMPY", b"MATLAB "
+"""First bytes of files that are no text."""
+HDF5 = b"MATLAB 7.3"
+PLACES = {"p", "pos", "position", "positions", "point", "points", "xyz", "marker", "markers", "measured", "tcp"}
+"""Names of arrays (N, 3) of places."""
+
+
+def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
+    """A table that is no text, with ``sep`` between its cells, and what was decided; None for text.
+
+    MeasurementError for a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
+    """
+    variables = b"\0" in data and (data.startswith(MATLAB) or path.suffix.lower() == ".mat")  # version 4 has no mark
+    if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY)):
+        return None
+    rows, notes = _table(path, data)
+    return csv_text(rows, sep), notes
+
+
+Rows = Sequence[Sequence[object]]
+
+
+@lru_cache(maxsize=2)  # a spreadsheet of 5000 rows takes a second, and `init` reads its tables many times
+def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
+    """The cells of a file that is no text, and what was decided."""
+    if data.startswith(OLD_SHEET):
+        raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
+    if data.startswith(HDF5):
+        raise _no_table(path, "a MATLAB file of version 7.3", "save it with `save(..., '-v7')`, or as CSV")
+    file = io.BytesIO(data)
+    if not data.startswith(ZIP):
+        return (_array if data.startswith(NUMPY) else _variables)(path, file)
+    names = list[str]()
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+    file.seek(0)
+    if names and all(name.endswith(".npy") for name in names):
+        return _joined(path, _loaded(path, lambda: dict(np.load(file, allow_pickle=False))))
+    return _spreadsheet(path, file)
+
+
+def _no_table(path: Path, got: str, fix: str) -> MeasurementError:
+    return MeasurementError.of(f"file '{path}' is no text but {got}", expected="a table", fix=fix)
+
+
+def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """The sheet with the most filled cells: values, not formulas."""
+    try:
+        from openpyxl import load_workbook  # noqa: PLC0415  # optional
+    except ImportError:
+        fix = "pip install 'diffeo_calib[excel]', or export the table as CSV"
+        raise _no_table(path, "a spreadsheet, and openpyxl, which reads it, is not installed", fix) from None
+    try:
+        book = load_workbook(file, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            sheet.reset_dimensions()  # which some programs write as one cell
+        sheets = {sheet.title: list(sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
+    except Exception as error:  # openpyxl raises errors of many kinds for damaged files
+        raise _no_table(path, f"a spreadsheet that cannot be read ({error})", "save it as .xlsx or CSV") from error
+    filled = {name: sum(cell is not None for row in rows for cell in row) for name, rows in sheets.items()}
+    if not any(filled.values()):
+        raise _no_table(path, "a spreadsheet without cells", "check that it was saved completely")
+    each = {
+        name: zip_longest(*(map(_cell, row) for row in sheets[name]), fillvalue="") for name in sheets if filled[name]
+    }
+    tables = {name: [[*row] for row in zip(*filter(any, columns), strict=True)] for name, columns in each.items()}
+    if (joined := _joined_sheets(tables)) is not None:
+        return joined
+    best = max(filled, key=filled.__getitem__)
+    others = [name for name in tables if name != best]
+    return tables[best], [f"sheet '{best}' read, not {few(others)}"] * bool(others)
+
+
+def _joined_sheets(sheets: Mapping[str, list[list[str]]]) -> tuple[Rows, list[str]] | None:
+    """Two sheets whose first lines have one common name, with the same different texts below it, side by side."""
+    each = [[row for row in rows if any(row)] for rows in sheets.values()]
+    common = {*each[0][0]} & {*each[-1][0]} - {""} if len(each) == 2 else set[str]()
+    if len(common) != 1:
+        return None
+    (by,), (one, other) = common, each
+    first, second = ({row[rows[0].index(by)]: row for row in rows} for rows in each)
+    if {*first} != {*second} or len({len(table) for table in (one, other, first)}) > 1:
+        return None
+    kept = [name != by for name in other[0]]
+    cells = [[*row, *compress(second[key], kept)] for key, row in first.items()]
+    return cells, [f"sheets {' and '.join(map(repr, sheets))} joined by '{by}'"]
+
+
+def _cell(value: Any) -> str:
+    """A number with all of its digits, or a text in one line."""
+    if value is None:
+        return ""
+    return repr(value) if isinstance(value, int | float) else " ".join(str(value).split())
+
+
+def _array(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """An array (N, k), or one with names."""
+    array = _loaded(path, lambda: np.load(file, allow_pickle=False))
+    if array.dtype.names:
+        return _joined(path, {name: array[name] for name in array.dtype.names})
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise _no_table(path, f"an array of shape {array.shape}", "save numbers of shape (N, columns), or with names")
+    return _texts(array), []
+
+
+def _variables(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
+    """Variables of MATLAB, and fields of those that are structures."""
+    from scipy.io import loadmat  # noqa: PLC0415  # slow to import
+
+    whole = _loaded(path, lambda: loadmat(file, squeeze_me=True, struct_as_record=True))
+    arrays = dict[str, Any]()
+    for name, value in whole.items():
+        fields = getattr(getattr(value, "dtype", None), "names", None)
+        if fields and value.ndim == 0:
+            arrays |= {f"{name}_{field}": value[field].item() for field in fields}
+        elif not name.startswith("__"):
+            arrays[name] = value
+    return _joined(path, arrays)
+
+
+def _loaded(path: Path, load: Callable[[], Any]) -> Any:
+    try:
+        return load()
+    except Exception as error:  # of damaged files, and of arrays of objects
+        raise _no_table(path, f"arrays that cannot be read ({error})", "save numbers alone, or export CSV") from error
+
+
+def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
+    """Arrays (N, ...) of numbers or texts side by side below their names; those of other lengths are left out."""
+    given = {name: np.asarray(array) for name, array in arrays.items()}
+    cells = {name: array for name, array in given.items() if array.dtype.kind == "O"}  # of MATLAB
+    given |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
+    usable = {name: array for name, array in given.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
+    written, turned = Counter[int](), Counter[int]()  # columns of arrays with so many rows, as they are and if turned
+    for array in usable.values():
+        rows, columns = len(array), array[:1].size
+        few_columns = min(rows, columns) if array.shape[1:] != (rows,) else 0  # a square may be either
+        written[rows] += few_columns
+        turned[max(rows, columns) if array.ndim == 2 else rows] += few_columns
+    if not usable:
+        raise _no_table(path, f"the arrays {few(list(given))}", "save numbers of shape (N,) or (N, columns)")
+    rows = max(written, turned, key=lambda counts: max(counts.values())).most_common(1)[0][0]
+    usable = {name: array.T if array.ndim == 2 and len(array) != rows else array for name, array in usable.items()}
+    kept = {name: array for name, array in usable.items() if len(array) == rows}
+    header = [column for name, array in kept.items() for column in names_of(name, array.shape[1:])]
+    values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in kept.values()), strict=True)
+    left = [name for name in given if name not in kept]
+    notes = [f"arrays {few(left)} left out: no numbers or texts of {rows} rows"] * bool(left)
+    return [header, *([cell for part in row for cell in part] for row in values)], notes
+
+
+def names_of(name: str, shape: tuple[int, ...]) -> Iterator[str]:
+    """Columns of an array."""
+    if not shape:
+        yield name
+    elif shape == (3,) and name.lower().rpartition("_")[2] in PLACES:
+        yield from (f"{name}_{axis}" for axis in "xyz")
+    elif len(shape) == 1:
+        yield from (f"{name}_{k + 1}" for k in range(shape[0]))
+    else:
+        yield from (f"{name}_{row}{column}" for row, column in product(range(shape[0]), range(shape[1])))
+
+
+def _texts(array: np.ndarray) -> list[list[str]]:
+    """The cells of an array (N, k)."""
+    array = array.astype(np.int64) if array.dtype.kind == "b" else array
+    array = array.astype(np.str_) if array.dtype.kind == "S" else array
+    return [[_cell(value) for value in row] for row in array.tolist()]

@@ -1,7 +1,6 @@
 """Tables as CSV files: any separator, decimal mark and unit in the file, SI inside.
 
-Units must be named: they are never guessed, but values that look as if they were in another unit cause a warning.
-Every mistake in a file is one error that names the file, the line and the column.
+Units are never guessed. Every mistake in a file is one error that names the file, the line and the column.
 """
 
 from __future__ import annotations

@@ -1,15 +1,9 @@
-"""Two tables as one: joint values in one file, measured places in another, joined by a column that both have.
+"""Two tables as one, joined by a common column or time; stops of a robot in recordings with clocks of their own.
 
-The joined lines have the numbers of those of the places. Texts of the column are compared as they are. Numbers that
-mostly differ are times: the nearest belong together if they are within half a step. Of two recordings, whose clocks may
-differ, every stop becomes a line.
-
-Stops of a robot in two recordings that have clocks of their own: its joint values, and what a device saw.
-
-A recording stands still where no value changes by more than a tolerance within a window around it. The clocks differ by
-the shift with which both stand still and move at the same times most often. A stop lasts as long as both stand still,
-without half a window at either end; its row is the mean over it. Of images, whose motion nobody looks at, a stop of the
-joints takes the one nearest to its middle: clocks that differ by less than half a stop do no harm.
+Joined lines have the numbers of those of the places. Numbers that mostly differ are times: the nearest belong together
+if they are within half a step; of two recordings every stop becomes a line. The clocks differ by the shift with which
+both stand still, within a window around each time, and move at the same times most often. A stop is the mean while both
+stand still, without half a window at either end, or the image nearest to its middle.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The columns of a table that tell joint values: expressions of columns, or those of a machine's commanded pose.
 
-A text such as ``-{J2}+90``, ``{J3}+{J2}`` or ``360/4096*{ticks5}-180`` is a sum of terms: a column in braces, perhaps
-times numbers, or a number: signs, zeros, couplings, gear ratios and encoder ticks. Values are in the units of the
-table. Any other text is the name of a column. Poses stand in place of joint values as a controller writes them.
+``-{J2}+90``, ``{J3}+{J2}`` or ``360/4096*{ticks5}-180`` is a sum of numbers, and of columns in braces times numbers, in
+the units of the table. Any other text is the name of a column.
 """
 
 from __future__ import annotations

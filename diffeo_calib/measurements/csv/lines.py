@@ -1,7 +1,6 @@
 """Lines of a table in a text file, read and written: its encoding, its header, and what is no row.
 
-What is unmistakable is read and noted: lines before the header, comments, a row of units, no header at all. Neither
-units nor robots are known here.
+What is unmistakable is read and noted: lines before the header, comments, a row of units, no header at all.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from typing import NamedTuple
 
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
-from diffeo_calib.measurements.csv.cells import csv_text, number, repeated
-from diffeo_calib.measurements.csv.sheets import MARKS, as_text, names_of
+from diffeo_calib.measurements.csv.cells import MARKS, as_text, csv_text, names_of, number, repeated
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
 Lines = list[tuple[int, list[str]]]  # line number in the file and cells of every line that is not blank

@@ -14,7 +14,7 @@ from diffeo_calib.calibration.result import Part
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.transmission import smooth_transmission
+from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import Deviations
 from diffeo_calib.reports.plots import style
@@ -45,7 +45,7 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     robot, name = model.robot, model.robot.joint_names[joint]
     measured, share = rows.q[:, joint], torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=rows.q.device)
     values = torch.lerp(measured.min(), measured.max(), share)
-    error = smooth_transmission(model.map.deformation, robot, name, values.to(model.configurations.device)).cpu()
+    error = transmission(model.map.deformation, robot, name, values.to(model.configurations.device), lines=False).cpu()
     error = 1e3 * (error - error.mean())
     band = 1e3 * TWO_SIDED_95 * rows.transmission_deviation(joint, values)
     x = joint_values(robot, joint, values).numpy()
