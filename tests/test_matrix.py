@@ -172,9 +172,6 @@ def evaluations(found: Any) -> list[Any]:
     return list(found.values()) if isinstance(found, Mapping) else [found]
 
 
-# --- models ---------------------------------------------------------------------------------------------------------
-
-
 @verb("calibrate")
 def _(bench: Bench) -> None:
     kind, found = bench.kind, bench.kind.result
@@ -220,9 +217,6 @@ def _(bench: Bench) -> None:
         assert "spread" in text.lower()
 
 
-# --- errors ---------------------------------------------------------------------------------------------------------
-
-
 @verb("evaluate")
 def _(bench: Bench) -> None:
     """In Python, and as a command, whose numbers are the same."""
@@ -260,9 +254,6 @@ def _(bench: Bench) -> None:
         bench.run("evaluate", kind.file, table, *options, "--tolerance", too_little, code=4)
 
 
-# --- where the device stands ----------------------------------------------------------------------------------------
-
-
 @verb("register")
 def _(bench: Bench) -> None:
     """In Python, and by `evaluate --free both`, which writes the same model."""
@@ -288,9 +279,6 @@ def _(bench: Bench) -> None:
         check_accuracy(kind, model, NEW_ROWS_FACTOR)
     if kind.name in THROUGHOUT:  # in the new frame
         assert 1e3 * evaluations(dc.evaluate(model, kind.moved))[0].rms < 2 * kind.source.worst_mm
-
-
-# --- queries --------------------------------------------------------------------------------------------------------
 
 
 @verb("predict")
@@ -390,9 +378,6 @@ def _(bench: Bench) -> None:
     bench.judged("recalibrate", kind.file, table, *options, "-o", bench.folder / "again.safetensors")
 
 
-# --- other programs -------------------------------------------------------------------------------------------------
-
-
 @verb("export")
 def _(bench: Bench) -> None:
     """Rigid kinematics from the rows of the fit; models that differ in form in every format."""
@@ -438,8 +423,6 @@ def _(bench: Bench) -> None:
     found.fit(data.q.numpy(), data.points.flatten(1).numpy() if plain else data)
     check_accuracy(kind, found.model_)
 
-
-# --- the table ------------------------------------------------------------------------------------------------------
 
 PAIRS = [(name, kind) for name, (_, kinds) in VERBS.items() for kind in kinds]
 

@@ -1,7 +1,5 @@
 """The package loads its public names when they are first used; a submodule never hides one of them."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import logging
@@ -21,7 +19,7 @@ from product_bank import Case, simulated, with_usual_scales
 import diffeo_calib as dc
 
 PACKAGE = Path(dc.__file__).parent
-SLOW = (
+SLOW = [
     "torch",
     "numpy",
     "scipy",
@@ -33,7 +31,7 @@ SLOW = (
     "safetensors",
     "rich",
     "typer",
-)
+]
 """Libraries that a bare import does not load."""
 NAMES: list[str] = vars(dc)["__all__"]
 
@@ -63,14 +61,6 @@ def test_an_import_is_light_silent_and_hides_nothing() -> None:
     printed = ["", "False calibrate fit evaluate", "True True", "True", "0 ['NullHandler']"]
     assert (done.stdout.splitlines(), done.stderr) == (printed, "")
     assert set(dir(dc)) >= FOLDERS
-
-
-def test_every_public_name_is_loaded_and_listed() -> None:
-    assert set(NAMES) <= set(dir(dc))
-    assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))
-    for name in NAMES:
-        assert getattr(dc, name).__module__.startswith("diffeo_calib.")
-    assert len(set(NAMES)) == len(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +98,6 @@ def test_names_seen_by_type_checkers_are_those_that_are_loaded() -> None:
 def test_unknown_names_are_attribute_errors() -> None:
     with pytest.raises(AttributeError, match=r"^module 'diffeo_calib' has no attribute 'calibarte'$"):
         dc.calibarte  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(ImportError, match="cannot import name 'calibarte'"):
-        from diffeo_calib import calibarte  # noqa: F401  # pyright: ignore[reportAttributeAccessIssue]
     assert not hasattr(dc, "_calibrate")
 
 
@@ -131,8 +119,6 @@ def test_extras_in_messages_and_pages_exist() -> None:
     assert {"camera", "collisions", "excel", "fused", "notebooks", "onnx", "ros"} == named
     assert named <= set(re.findall(r"^(\w+) = ", table, re.MULTILINE))
 
-
-# --- every Python -----------------------------------------------------------------------------------------------------
 
 IMPORT_ALL = """
 import importlib, pkgutil, sys
@@ -181,9 +167,6 @@ def test_every_module_can_be_imported(version: str) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-# --- logging ----------------------------------------------------------------------------------------------------------
-
-
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.name.startswith("diffeo_calib.")]
 
@@ -206,9 +189,6 @@ def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFix
     assert found[places[-1]] == "rows that look wrong and hardly count: 7"
     assert f"model written to {tmp_path}/arm.safetensors" in found
     assert "judged by 20 rows it has not seen, 20 were used before" in found
-
-
-# --- notebooks --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["arm", "posed"])

@@ -121,11 +121,6 @@ def grown(found: dict[str, int], held: dict[str, int]) -> list[str]:
     ]
 
 
-def lowered(found: dict[str, int], held: dict[str, int]) -> dict[str, int]:
-    """What is recorded next: of every room that is still there the smaller number."""
-    return {room: min(lines, held.get(room, lines)) for room, lines in sorted(found.items())}
-
-
 def test_lines_only_fall() -> None:
     found = grown(lines_of_package(), json.loads(SIZES.read_text(encoding="utf-8")))
     advice = "delete as much as you add; `python tests/test_sizes.py` records lower numbers and new folders"
@@ -134,4 +129,5 @@ def test_lines_only_fall() -> None:
 
 if __name__ == "__main__":
     held = json.loads(SIZES.read_text(encoding="utf-8")) if SIZES.exists() else {}
-    SIZES.write_text(json.dumps(lowered(lines_of_package(), held), indent=1) + "\n", encoding="utf-8")
+    lowered = {room: min(lines, held.get(room, lines)) for room, lines in sorted(lines_of_package().items())}
+    SIZES.write_text(json.dumps(lowered, indent=1) + "\n", encoding="utf-8")

@@ -30,11 +30,7 @@ def compiled(command: Sequence[str | Path | None]) -> None:
 
 
 class CModel:
-    """A source file as a shared library.
-
-    Args:
-        source: the C file. joints: n. markers: P. prefix: of the names, by default the file's stem.
-    """
+    """A source file as a shared library."""
 
     def __init__(self, source: Path, joints: int, markers: int, prefix: str | None = None) -> None:
         library = source.with_suffix(".so")

@@ -55,11 +55,7 @@ def marked(*names: str) -> list[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A table of one kind, the model of its first rows, and files of both.
-
-    Args:
-        name: of the kind. source: rows and truth. folder: of its files.
-    """
+    """A table of one kind, the model of its first rows, and files of both."""
 
     name: str
     source: Source

@@ -1,7 +1,4 @@
-"""The problem bank of the mathematics: kernels with their textbook formulas, naive algorithms, and test problems.
-
-The second implementations use explicit pairs and plain autograd; they share only data types with the package.
-"""
+"""The problem bank of the mathematics: kernels with their textbook formulas, naive algorithms, and test problems."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -63,9 +60,6 @@ def circle(dim: int = 1) -> Space:
 def constant_kernel(variance: object = 1.0) -> RadialKernel:
     """K = variance: one common translation of all points."""
     return RadialKernel(ConstantProfile(), variance=variance)
-
-
-# --- Textbook profiles ------------------------------------------------------------------------------------------
 
 
 def gaussian(r2: Tensor) -> Tensor:
@@ -241,9 +235,6 @@ def case_named(name: str) -> Case:
     return next(case for case in CASES if case.name == name)
 
 
-# --- Naive algorithms -------------------------------------------------------------------------------------------
-
-
 def naive_rk4(field: Callable[[Tensor], Tensor], state: Tensor, steps: int) -> list[Tensor]:
     """States at the nodes of [0, 1]."""
     h, states = 1.0 / steps, [state]
@@ -278,8 +269,6 @@ def slopes(errors: list[float]) -> list[float]:
     """Orders of convergence when each entry halves the step of the one before."""
     return [log2(a / b) for a, b in pairwise(errors)]
 
-
-# --- Problems ---------------------------------------------------------------------------------------------------
 
 K_V, K_W = section_5_kernels()
 

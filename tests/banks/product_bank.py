@@ -1,8 +1,4 @@
-"""Shared by the product tests: simulated robots whose truth is known, and formulas written a second time.
-
-The covariance formulas are those of DESIGN sections 5 and 6, with explicit loops over pairs of configurations;
-nothing is shared with the package but the data types and the geometry's derivatives.
-"""
+"""Shared by the product tests: simulated robots whose truth is known, and formulas written a second time."""
 
 import math
 from dataclasses import dataclass, replace

@@ -155,13 +155,7 @@ def mapped(change: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 class Place(NamedTuple):
-    """A device for tests.
-
-    Args:
-        name: what to move problems and models to.
-        exact: whether its results are those of the CPU bit by bit.
-        entered: makes the context in which it can be used.
-    """
+    """A device for tests."""
 
     name: str
     exact: bool

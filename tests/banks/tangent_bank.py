@@ -1,7 +1,4 @@
-"""The tangent model of a robot written a second time, with gravity, geometric priors and every kind of noise.
-
-Nothing is shared with the package but data types, the nominal map and its derivatives by joints and error twists.
-"""
+"""The tangent model of a robot written a second time, with gravity, geometric priors and every kind of noise."""
 
 from dataclasses import replace
 from functools import cache

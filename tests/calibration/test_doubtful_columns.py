@@ -1,7 +1,5 @@
 """Columns that are not what they seem: stuck, rounded, of unnamed markers, of markers that nobody measured."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
@@ -32,8 +30,6 @@ from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
-
-# --- columns of one value ---------------------------------------------------------------------------------------------
 
 HELD = {
     "poses": ("pose", "z"),
@@ -112,9 +108,6 @@ def test_deviations_and_a_few_rows_are_no_stuck_columns_and_others_are() -> None
     assert any("'marker3_z' of the positions holds one value" in one for one in texts)
 
 
-# --- joint values with few digits -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("step", "words"), [(5e-4, "0.0005 rad"), (math.radians(0.01), "0.01 degrees")])
 def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     values = (arm.train.q[:, 1] / step).round() * step
@@ -136,8 +129,6 @@ def test_rounded_joint_values_are_warned_about_where_they_cause_the_error(step: 
     _, texts = warned(with_usual_scales, arm.nominal, dc.Measurements(q, points))
     assert [bool(re.search(words, one)) for one in texts if "rounded" in one] == [True] * (step == 1e-3)
 
-
-# --- a column that nobody read names the marker of each row -----------------------------------------------------------
 
 ROWS = 45
 ARM = SimulatedArm(seed=4, markers=3)
@@ -185,8 +176,6 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
     data = labelled(tmp_path / "t.csv", points, labels, q)
     assert marker_column(register(ARM.nominal, data.q, data.points).geometry, data) is None
 
-
-# --- markers that nobody measured -------------------------------------------------------------------------------------
 
 PAIR = SimulatedArm(seed=5, markers=2)
 PAIR_ROWS = dc.Measurements(*PAIR.measure(40, seed=1), PAIR.nominal.joint_names)

@@ -1,7 +1,5 @@
 """Tables that were read wrongly: the right reading is found among others, and named only where the data tell."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable
@@ -181,8 +179,6 @@ def test_joints_of_a_slide() -> None:
     read = dc.Measurements(with_joint(data.q, 2, 1e-3), data.points)
     assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
 
-
-# --- signs, zeros, couplings and units of joint values ----------------------------------------------------------------
 
 UP, Y, X = [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
 

@@ -255,9 +255,6 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     assert command(*words).code == 0
 
 
-# --- rows over standard input: answered one by one, none taken in twice or by half -----------------------------------
-
-
 WORDS = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--base", "base_link", "--tip", "flange"]
 
 

@@ -61,19 +61,11 @@ def test_headers_of_devices(line: str) -> None:
         assert (found.place, found.turn) == (place, turn)
 
 
-@pytest.mark.parametrize(
-    ("measured", "wished"),
-    [
-        ("{}_ist", "{}_soll"),
-        ("{}_act", "{}_nom"),
-        ("{}", "ref_{}"),
-        ("laser_{}", "cmd pose {}"),
-        ("{}mesure", "consigne {}"),
-        ("{} реал", "planned{}"),
-        ("{}", "desired {} [mm]"),
-        ("实测{}", "目标{}"),
-    ],
-)
+WISHED = "{}_ist|{}_soll, {}_act|{}_nom, {}|ref_{}, laser_{}|cmd pose {}, {}mesure|consigne {}, {} реал|planned{}"
+WISHED += ", {}|desired {} [mm], 实测{}|目标{}"
+
+
+@pytest.mark.parametrize(("measured", "wished"), [pair.split("|") for pair in WISHED.split(", ")])
 def test_wished_places_are_no_markers(measured: str, wished: str) -> None:
     for axes in ("xyz", "XYZ"):
         places = triple(wished, axes), triple(measured, axes)

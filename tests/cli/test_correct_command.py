@@ -245,11 +245,9 @@ BOTH = ["--tip", "left", "--tip", "right"]
         (["--frame", "measuring"], "--frame measuring: the nominal poses of commands are in the robot's base"),
         (["--limit", "0"], "--limit: expected a number above 0"),
         (["--rotation", "a,b,c"], "--rotation without --position"),
-        (["--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--tip", "left", "--tip", "left"], "--tip left is named twice"),
         (["--tip", "left", "--tip", "foot"], "--tip: expected one of"),
         ([*BOTH, "--tool", "0,0,1"], "--tool: expected 2 of them, got 1"),
-        ([*BOTH, "--position", "x,y,z"], "--position: expected 2 of them, got 1"),
         ([], "has several tips"),
     ],
 )

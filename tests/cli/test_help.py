@@ -1,7 +1,4 @@
-"""Help names every command, option and default, with its explanation; it and completion load nothing slow.
-
-What a terminal shows of names and cells, short and without control characters; the progress line.
-"""
+"""Help names every command, option and default, with its explanation; it and completion load nothing slow."""
 
 import importlib
 import re

@@ -23,8 +23,6 @@ from diffeo_calib.measurements.poses import rotation_numbers, to_spherical
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-# --- the robot and its links ---
-
 JOINT = (
     '<link name="{2}"/><joint name="{0}" type="{3}"><parent link="{1}"/><child link="{2}"/>'
     '<origin xyz="0 0 .06"/><axis xyz="0 1 0"/><limit lower="0" upper=".8"/>{4}</joint>'
@@ -77,14 +75,6 @@ def test_the_tip_is_what_carries_the_marker(tip: str, tmp_path: Path, proposed: 
     assert entries["tip"] == tip
 
 
-def test_links_without_usual_names_and_joints_that_follow(tmp_path: Path, proposed: Proposed) -> None:
-    """The tip is the link of the last joint, behind a wrist that follows the arm's own joints."""
-    follows = f'<mimic joint="{NAMES[1]}" multiplier="0"/>'
-    write_arm(tmp_path, ("level", "flange", "plate", "revolute", follows), ("screws", "plate", "probe", "fixed", ""))
-    q, points = rows()
-    assert proposed((NAMES, q), (XYZ, points))[0]["tip"] == "plate"
-
-
 def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, proposed: Proposed) -> None:
     """Numbered columns may be of either arm; named after its joints they are of one."""
     write_arm(tmp_path)
@@ -135,9 +125,6 @@ def test_the_convention_that_explains_the_rows(
     assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons(text)["robot"]
     fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *GIVEN, "-o", tmp_path / "m")
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
-
-
-# --- columns whose names leave something open ---
 
 
 def test_of_equal_series_the_robot_decides(proposed: Proposed, tmp_path: Path, command: Command) -> None:
@@ -227,8 +214,6 @@ def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -
     _, text = proposed((some, q[:, :5]), (XYZ, points))
     assert f"No column is named after {NAMES[3]}" in text
 
-
-# --- units, and what the columns of joints mean ---
 
 LIFT = """<robot name="lift"><link name="floor"/>
 <joint name="up" type="prismatic"><parent link="floor"/><child link="a"/><axis xyz="0 0 1"/>

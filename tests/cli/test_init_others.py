@@ -11,7 +11,6 @@ from kind_bank import kind_named
 from product_bank import simulated_poses
 
 import diffeo_calib as dc
-from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.cli.main import expanded
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -44,23 +43,6 @@ def test_sockets_of_a_panda(ur10_folder: Path, init: Proposed) -> None:
     """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
     data = ur10_folder.parent / "mukca"
     assert init(data / "panda_3.csv", data / "panda.urdf")[0]["angle"] == "rad"
-
-
-def test_the_ur10(ur10_folder: Path, tmp_path: Path, init: Proposed) -> None:
-    """Every fourth of its rows."""
-    table = tmp_path / "ur10.csv"
-    header, *lines = (ur10_folder / "measurements_iso_cubes.csv").read_text().splitlines()
-    table.write_text("\n".join([header, *lines[::4]]))
-    assert guess_sheet(table).decimal == ","
-    _, text = init(table, ur10_folder / "ur10_robot.urdf")
-    for line in (
-        *('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"),
-        *('rotation = "measurement_rx,measurement_ry,measurement_rz"', 'convention = "XYZ"', 'rotation-angle = "deg"'),
-        'std = "measurement_std_x,measurement_std_y,measurement_std_z"',
-    ):
-        assert line in text
-    assert "time = " not in text, "numbers that `fit` refuses"
-    assert "Timestamp, Goal x" in text.splitlines()[-1]
 
 
 def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, init: Proposed) -> None:

@@ -67,10 +67,7 @@ def test_an_earlier_result_is_not_mistaken_for_this_one(
 ) -> None:
     """The command ends before it could begin: nothing is left, whatever the exit code is looked at."""
     monkeypatch.chdir(folder)
-    (folder / "out.json").write_text(STALE, encoding="utf-8")
+    (folder / "out.json").write_text('{"format": "diffeo_calib result", "exit_code": 0}', encoding="utf-8")
     (folder / "c.toml").write_text('csv = "new.csv"\njson = "out.json"\nlength = "furlong"\n', encoding="utf-8")
     assert command(*words.split()).code in (1, 2)
     assert not (folder / "out.json").exists()
-
-
-STALE = '{"format": "diffeo_calib result", "exit_code": 0}'

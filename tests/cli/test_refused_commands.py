@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_bank import ROTATION, TABLE, Command, Edit, Site, edited, rows_of, set_cell
+from command_bank import ROTATION, TABLE, Command, Edit, Site, edited, rows_of
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -78,10 +78,6 @@ REFUSED = {
     r"--rotation-angle is missing: expected 'rad'": given(*ROTATION[:4], edit=turned),
     r"--lever without --rotation": given("--lever", "100"),
     r"--std: expected names of columns: one, one per marker or three per": given("--std", "a,b"),
-    r"`lever`.*above 0, got -0.005": given("--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5", edit=turned),
-    r"line 5, column 'my': expected a number, got 'far'": given(edit=set_cell(4, 7, "far")),
-    r"for 'elbow_joint', did you mean elbow_jiont": given(edit=set_cell(0, 2, "elbow_jiont")),
-    r"line 32 repeats 4; real repeats differ by noise": given(edit=lambda cells: [*cells, cells[3]]),
     r"in 1 row.*|at least 2|2 distinct": given(edit=rows_of(0, 1)),
     r"at least 3 poses, got 2.*measure more poses": given("--holdout", "0", edit=rows_of(0, 1, 2)),
 }
@@ -110,17 +106,11 @@ def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, co
     kernels = dc.VonMises(1.0), dc.Gaussian(1.0)
     problem = dc.Problem(lambda q: q * 1.0, x, x + 0.01, noise=0.01, joint_kernel=kernels[0], task_kernel=kernels[1])
     dc.save(dc.fit(problem).model, tmp_path / "plain.safetensors")
-    misspelt = edited(small_site, tmp_path / "bad.csv", set_cell(0, 5, "wrist_rol_joint"))
     poses = edited(small_site, tmp_path / "t.csv", turned)
     whole = sound, (tmp_path / "plain.safetensors").read_bytes()
-    damaged = sound.replace(b'\\"rows\\": 10', b'\\"rows\\": 99'), csv.read_bytes()
     for content, words, message in (
-        (b"", ["predict", "nowhere", csv, *TABLE[2:], *out], "there is no model file"),
-        (damaged[0], ["predict", model, csv, *TABLE[2:], *out], "checksum does not match"),
-        (damaged[1], ["predict", model, csv, *TABLE[2:], *out], "cannot be read as a model file"),
         (b"", ["evaluate", small_site.urdf, csv, *TABLE], "it is a URDF; pass a file written by"),
         (whole[1], ["evaluate", model, csv, *TABLE], "plain function"),
-        (whole[0], ["evaluate", model, misspelt, *TABLE], "did you mean wrist_rol_joint"),
         (whole[0], ["evaluate", model, csv, *TABLE, "--joints", "waist_joint"], "expected 6 columns, in the order"),
         (
             whole[0],

@@ -52,9 +52,6 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
     assert "expected absolute error" in done.out
 
 
-WIRE = ["--reading", "distance=wire", "--session", "anchor"]
-
-
 @pytest.fixture(scope="module")
 def wires(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
@@ -92,11 +89,9 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
-        ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
-        (["--reading", "distance=wire", "--tip", "tool"], "tool"),
     ],
 )
 def test_refused_rows(

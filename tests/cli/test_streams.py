@@ -1,7 +1,4 @@
-"""No work is lost where its output goes nowhere (cut pipes, full disks, closed streams), and no code changes.
-
-Ctrl-C at any moment: one sentence, and the best model so far if there is one.
-"""
+"""No work is lost where its output goes nowhere (cut pipes, full disks, closed streams), and no code changes."""
 
 import json
 import os

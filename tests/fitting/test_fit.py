@@ -122,22 +122,6 @@ def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
     assert stopped.integrator.intervals <= 2, "before the optimum, the end residual does not measure the time steps"
 
 
-@pytest.mark.slow
-def test_few_control_points_fit_many_data() -> None:
-    """100 of 256 configurations as controls: a small held-out error, and L-BFGS finds the same optimum."""
-    problem = rr_problem(16)
-    x = uniform(300, 2, seed=2)
-    fit = dc.fit(problem, integrator=dc.RK4(2), controls=100)
-    assert fit.converged
-    assert len(fit.model.deformation.x) == 100
-    assert fit.model.x is problem.x
-    nominal, fitted = ((y - elastic_rr.real(x)).norm(dim=1).mean() for y in (elastic_rr.nominal(x), fit.model(x)))
-    assert float(fitted) <= 1e-4 * float(nominal)
-    solver = dc.LBFGS(max_iterations=20)
-    after = dc.fit(problem, solver, dc.RK4(2), controls=fit.problem.controls, start=fit.momenta)
-    assert fit.energy * (1 - 1e-6) <= after.energy <= fit.energy
-
-
 def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
     fit = dc.fit(rr_problem(6), integrator=dc.RK4(1), controls=20, progress=stop_at(2))
     assert fit.solution.interrupted

@@ -59,19 +59,6 @@ def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None
     assert fine.energy * (1 - 1e-8) <= after.energy <= fine.energy
 
 
-def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
-    for start in (tangent(small.problem).momenta(), random_start(small.problem)):
-        other = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(2), start=start)
-        assert other.converged
-        assert other.energy == pytest.approx(small.energy, rel=1e-8)
-        torch.testing.assert_close(
-            other.momenta.joint, small.momenta.joint, rtol=0, atol=1e-4 * float(small.momenta.joint.norm())
-        )
-        torch.testing.assert_close(
-            other.momenta.task, small.momenta.task, rtol=0, atol=1e-4 * float(small.momenta.task.norm())
-        )
-
-
 def test_data_without_error_need_no_deformation() -> None:
     x = uniform(8, 2, seed=3)
     problem = Problem(

@@ -1,7 +1,4 @@
-"""Denavit-Hartenberg tables of any chain: the same poses, few numbers, and no offsets of hundreds of metres.
-
-The kinematics file of Universal Robots' packages: by their formula it gives the poses of the geometry.
-"""
+"""Denavit-Hartenberg tables of any chain: the same poses, few numbers, and no offsets of hundreds of metres."""
 
 import csv
 import math
@@ -63,18 +60,6 @@ def test_nearly_parallel_axes(angle: float, convention: str) -> None:
     torch.testing.assert_close(table.poses(q), own_poses(geometry, q), rtol=0, atol=1e-12)
     assert all(abs(value) < 20 for row in table.rows for value in (row.a, row.d))
     assert all(abs(row.beta) < 0.06 for row in table.rows)
-
-
-def test_a_ur10_has_its_maker_s_table(ur10_folder: Path) -> None:
-    robot = dc.load_urdf(ur10_folder / "ur10_robot.urdf", "base_link", "ee_link")
-    table = dh_table(Geometry.nominal(robot))
-    found = np.abs([[row.a, row.d, row.alpha, row.theta, row.beta] for row in table.rows])
-    quarter = math.pi / 2
-    lengths = [[0, 0.1273], [0.612, 0], [0.5723, 0], [0, 0.163941], [0, 0.1157], [0, 0.0922]]
-    twists = [quarter, 0, 0, quarter, quarter, quarter]  # the last one to the x axis of ee_link
-    expected = [[*pair, twist, 0, 0] for pair, twist in zip(lengths, twists, strict=True)]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
-    assert torch.equal(table.base, torch.eye(4, dtype=torch.float64))
 
 
 def read_back(path: Path, length: str, angle: str, convention: str) -> tuple[Tensor, Chain, Tensor]:
@@ -225,18 +210,6 @@ def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
     for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
         with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
             write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)
-
-
-def test_the_real_ur10(ur10_folder: Path, tmp_path: Path) -> None:
-    """Its file has angles of 12 digits, which turn tool0 from the axis by 5e-12 rad."""
-    robot = dc.load_urdf(ur10_folder / "ur10_robot.urdf", "base_link", "tool0")
-    geometry, q = wrong(robot), configurations(robot)
-    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
-    links, _ = read_yaml(tmp_path / "ur.yaml")
-    theirs, ours = their_poses(links, q), own_poses(geometry, q)
-    rest = torch.linalg.inv(theirs) @ ours
-    torch.testing.assert_close(rest, rest[:1].expand_as(rest), rtol=0, atol=1e-14)
-    torch.testing.assert_close(rest[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-11)
 
 
 def test_other_robots_are_refused(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Sums by plane waves: within the accuracy asked for, or over all pairs."""
 
-from math import pi
 from typing import Any
 
 import pytest
@@ -11,7 +10,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, fourier
 from diffeo_calib.kernels.reductions.formulas import FIELD, Formula, Points
 
@@ -40,31 +39,6 @@ def test_errors_stay_below_the_accuracy(profile: Profile, formula: Formula, dim:
         found = fourier.sums(formula, profile, rows, columns, accuracy)
         assert found is not None or (dim == 2 and isinstance(profile, MaternProfile))
         assert_same(found or exact, exact, accuracy * terms * COUNT)
-
-
-@smooth
-@pytest.mark.parametrize("accuracy", [1e-2, 1e-7])
-@pytest.mark.parametrize("side", [0.1, 20.0])
-def test_a_kernel_is_bounded_at_all_distances(profile: Profile, accuracy: float, side: float) -> None:
-    """Between the corners of the box the copies of the kernel are nearest."""
-    waves = fourier.Lattice.of(profile, torch.tensor([side], dtype=torch.float64), accuracy)
-    apart = torch.linspace(-side, side, 501, dtype=torch.float64)[:, None]
-    assert waves is not None
-    assert waves.error(profile, apart) < accuracy
-
-
-@pytest.mark.parametrize("profile", [p for p in PROFILES.values() if p.spectral_density(torch.ones(1), 1) is not None])
-def test_the_spectral_density_is_the_fourier_transform(profile: Profile) -> None:
-    """Integrated over one and over three dimensions, by the trapezoidal rule."""
-    w = torch.linspace(0.0, 400.0, 400_001, dtype=torch.float64)
-    for r in (0.0, 0.7, 2.0):
-        kappa = profile.derivative(torch.tensor(r * r, dtype=torch.float64), 0)
-        one, three = (profile.spectral_density(w.square(), dim) for dim in (1, 3))
-        assert one is not None
-        assert three is not None
-        assert float(torch.trapezoid(2 * one * (w * r).cos(), w)) == pytest.approx(float(kappa), abs=2e-6)
-        shell = 4 * pi * w.square() * three * torch.sinc(w * r / pi)
-        assert float(torch.trapezoid(shell, w)) == pytest.approx(float(kappa), abs=3e-3)
 
 
 @pytest.mark.parametrize("kernel", [dc.Gaussian([0.5, 2.0]), TORUS, dc.Gaussian(0.4) + dc.Cauchy(1.0)])

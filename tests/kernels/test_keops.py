@@ -1,8 +1,4 @@
-"""KeOps: really compiled sums against those of one matrix, its environment, and tiled sums where it does not work.
-
-Every formula is compiled with one profile, the other operations of profiles with the shortest formula: 6 times about
-7 s where KeOps' cache folder is empty.
-"""
+"""KeOps: really compiled sums against those of one matrix, its environment, and tiled sums where it does not work."""
 
 import json
 import os

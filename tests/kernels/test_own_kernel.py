@@ -137,13 +137,6 @@ class Short(RationalQuadratic):
         return (super().derivative(r2, order),)[max(order - 2, 0)]
 
 
-class Needy(RationalQuadratic):
-    """Has no usual parameter."""
-
-    def __init__(self, alpha: float) -> None:
-        super().__init__(alpha)
-
-
 WRONG: list[tuple[Profile, str]] = [
     (RationalQuadratic(wrong=(1, 2.0)), r"`derivative` of order 1 at r2 = 0\.31: expected -0\.391[^;]* got -0\.782"),
     (RationalQuadratic(wrong=(2, 1.01)), "`derivative` of order 2"),
@@ -213,7 +206,6 @@ def test_a_model_with_kernel_and_profile_is_loaded(saved: tuple[Any, Path]) -> N
         ({"Skewed": Skewed}, r"uses the profile 'rq', which is not part of diffeo_calib.*load\(path, kernels=\{'rq': "),
         (OWN | {"rq": RationalQuadratic(2.4)}, "profile 'rq' .* is not that of the model: expected kappa = 1, "),
         (OWN | {"rq": RationalQuadratic}, "is not that of the model"),  # called without arguments
-        (OWN | {"rq": Needy}, "needs arguments"),
         (OWN | {"rq": RationalQuadratic(2.5, wrong=(2, 1.1))}, "`derivative` of order 2"),
         *((classes, NO_CLASSES) for classes in (["Skewed"], {"Skewed": Skewed(0.7, 0.4)}, {"Skewed": dict}, Skewed)),
     ],

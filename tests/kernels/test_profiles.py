@@ -1,9 +1,5 @@
-"""Radial profiles compared with independent high-precision formulas and with autograd."""
+"""Radial profiles at zero, and where derivatives end; test_kernels.py has their textbook formulas."""
 
-from collections.abc import Callable
-from typing import Any
-
-import mpmath
 import pytest
 import torch
 from math_bank import tensor
@@ -11,41 +7,13 @@ from math_bank import tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import MAX_ORDER, PROFILES, GaussianProfile
 
-RADII = (0.03, 0.2, 0.9, 2.3, 7.0)
-
-
-def bessel(nu: float) -> Callable[[Any], Any]:
-    """The textbook Matern 2^(1 - nu) / Gamma(nu) (sqrt(2 nu) r)^nu K_nu(sqrt(2 nu) r), in r2 = r^2."""
-
-    def kappa(r2: Any) -> Any:
-        z = mpmath.sqrt(2 * mpmath.mpf(nu) * r2)
-        return 2 ** (1 - mpmath.mpf(nu)) / mpmath.gamma(nu) * z**nu * mpmath.besselk(nu, z)
-
-    return kappa
-
-
-TEXTBOOK: dict[str, Callable[[Any], Any]] = {
-    "gaussian": lambda r2: mpmath.exp(-r2 / 2),
-    "cauchy": lambda r2: 1 / (1 + r2),
-    "constant": lambda r2: mpmath.mpf(1) + 0 * r2,
-    "matern32": bessel(1.5),
-    "matern52": bessel(2.5),
-    "matern72": bessel(3.5),
-}
-
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_derivatives_are_those_of_the_textbook_and_of_autograd(name: str) -> None:
-    profile, r2 = PROFILES[name], tensor(RADII)
-    for order in range(MAX_ORDER + 1):
-        with mpmath.workdps(40):
-            expected = tensor([float(mpmath.diff(TEXTBOOK[name], mpmath.mpf(x), order)) for x in RADII])
-        torch.testing.assert_close(profile.derivative(r2, order), expected, rtol=2e-12, atol=1e-15)
-        torch.testing.assert_close(profile.derivatives(r2, order)[order], expected, rtol=2e-12, atol=1e-15)
+def test_every_derivative_is_the_slope_of_the_one_before(name: str) -> None:
+    profile, r2, h = PROFILES[name], tensor([0.03, 0.9, 2.3, 40.0]), 1e-5
     for order in range(MAX_ORDER):
-        live = r2.clone().requires_grad_()
-        (actual,) = torch.autograd.grad(profile.derivatives(live, order)[order].sum(), live)
-        torch.testing.assert_close(actual, profile.derivative(r2, order + 1), rtol=1e-13, atol=1e-15)
+        change = (profile.derivative(r2 + h, order) - profile.derivative(r2 - h, order)) / (2 * h)
+        torch.testing.assert_close(profile.derivatives(r2, order + 1)[order + 1], change, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -71,18 +71,6 @@ def test_inverse_reaches_its_targets(arm: Case) -> None:
         small.inverse(small(small.map.x) + 100.0 * torch.eye(9)[1, :, None, None].double(), small.map.x)
 
 
-def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
-    """Commanded through the inverse, the true arm reaches its targets ten times more accurately."""
-    truth, _, _ = simulated(1)
-    commanded = arm.test.q[:40]
-    registered = arm.result.registration.geometry
-    targets = registered.points(commanded)  # targets of the nominal robot
-    q = arm.model.inverse(targets, commanded)
-    before = (truth.true_points(commanded) - targets).norm(dim=-1).square().mean().sqrt()
-    after = (truth.true_points(q) - targets).norm(dim=-1).square().mean().sqrt()
-    assert float(after) < 0.1 * float(before)
-
-
 def test_no_rows(arm: Case) -> None:
     none = arm.test.q[:0]
     assert arm.model(none).shape == (0, 1, 3)

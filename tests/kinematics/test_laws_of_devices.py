@@ -1,7 +1,5 @@
 """Laws of devices of every kind, those of scripts/examples too: exact readings, two devices, other points."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,4 @@
-"""Laws of set-ups: moved devices, and markers mounted anew, in the frame of a model.
-
-What is known of a camera and its board is what small changes of the fit's parameters do to their poses.
-"""
+"""Laws of set-ups: moved devices, and markers mounted anew, in the frame of a model."""
 
 from collections.abc import Callable
 from dataclasses import replace

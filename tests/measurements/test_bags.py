@@ -201,13 +201,11 @@ def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, recor
         (written["other"], PICTURES, [], [".png"]),
         (written["other"], PICTURES, ["--offset", "-0.6"], ["without an image"]),
         (written["other"], PICTURES, ["--still", "0.001,2"], ["stops"]),
-        (written["other"], PICTURES, ["--still", "0,1"], ["--still: expected a number above 0"]),
         (written["other"], PICTURES, ["--still", "1,2,3"], ["expected MOTION, or MOTION,SECONDS"]),
         (written["other"], PICTURES, ["--offset", "nan"], ["--offset: expected a number"]),
         (written["unknown"], PICTURES, [], ["bayer_rggb8", "bgr8"]),
         (written["cut"], PICTURES, [], ["5 x 4", "3 bytes"]),
         (tmp_path / "empty", PLACES, [], ["empty", PLACES]),
-        (tmp_path / "none", PLACES, [], ["none"]),
         (written["damaged"], PLACES, [], ["cannot be read", "utf-8"]),
     ):
         record.refused(path, topic, *words, more=more)

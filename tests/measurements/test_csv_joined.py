@@ -49,12 +49,7 @@ def test_mistakes_name_both_files(tmp_path: Path) -> None:
     for joints, places, by, message in (
         ((*JOINTS, "p3,7,8"), PLACES, "pose", r"places\.csv', line 2, pose p3: expected one partner, got lines 4, 5"),
         (JOINTS, twice, "pose", r"joints\.csv', line 2, pose p1: .* got lines 4, 6 .*--marker"),
-        (
-            JOINTS,
-            ("x,y,z,pose", "1,2,3,q1"),
-            "pose",
-            "--by pose: expected values that both files have, got 3 of joints",
-        ),
+        (JOINTS, ("x,y,z,pose", "1,2,3,q1"), "pose", "--by pose: expected values that both files have, got 3 of"),
         (("name,a,b", *JOINTS[1:]), PLACES, "name", r"places\.csv', header: no column \['name'\]"),
     ):
         with pytest.raises(MeasurementError, match=message):

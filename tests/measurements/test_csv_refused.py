@@ -1,7 +1,5 @@
 """Every mistake in a file or its description is one error that names the file, the line and the column."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ PARTS = {"position": ["p_x", "p_y", "p_z"]}
 STATED = "expected mm, as stated, got {} in the file; state the unit"
 FILES: list[Case] = [
     ("", {}, "is empty: expected a header"),
-    (",,\n,,\n", {}, "is empty"),
     (",,\n1,2,3\n", {}, "no column"),
     (HEADER, {}, "header but no rows: expected at least one row"),
     (TABLE + "1,2,3\n", {}, "line 4: expected 5 cells ... got 3"),
@@ -34,11 +31,7 @@ FILES: list[Case] = [
     (HEADER, {"position": ["x", "y", "height"]}, "no column ['height'] ... written in the header"),
     (GERMAN + "1;2;3;4;5\n", {}, "single column 'q1;q2;x;y;z' without ',' ... pass sep=';'"),
     (DECIMALS, {"sep": ";"}, "line 3, column 'q1' (and 2 more, on line 4) ... '1,5' ... decimal comma ... decimal=','"),
-    (
-        GERMAN + "1.5;2;3;4;5\n1,5;2;3;4;5\n",
-        {"sep": ";", "decimal": ","},
-        "line 2, column 'q1' ... got '1.5' ... decimal='.'",
-    ),
+    (GERMAN + "1.5;2;3;4;5\n1,5;2;3;4;5\n", {"sep": ";", "decimal": ","}, "line 2, column 'q1' ... '1.5' ... decimal="),
     (GERMAN + "1;2;1.234;4;5\n", {"sep": ";", "decimal": ","}, "column 'x' ... thousands"),
     (GERMAN + "1;2;1,000;4;5\n", {"sep": ";"}, "line 2, column 'x' ... decimal=',' ... thousands"),
     (HEADER + "1,2,far,4,5\n", {}, "line 2, column 'x': expected a number, got 'far'"),
@@ -60,8 +53,6 @@ FILES: list[Case] = [
 OPTIONS: list[Case] = [
     (TABLE, {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
     (TABLE, {"angle": "degrees"}, "`angle`: expected 'rad' or 'deg', got 'degrees'"),
-    (TABLE, {"joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
-    (TABLE, {"decimal": ";"}, "`decimal` ... ';'"),
     (TABLE, {"decimal": ","}, "`sep` and `decimal`: expected different ... sep=';'"),
     (TABLE, {"sep": "::"}, "`sep`: expected one character, got '::'"),
     (TABLE, {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
@@ -70,17 +61,12 @@ OPTIONS: list[Case] = [
     (TABLE, {"position": [["x", "y", "z"]] * 2}, "distinct columns, got ['x'"),
     (TABLE, {"position": "xyz"}, "`position`: expected three names"),
     (TABLE, {"position": [["x", "y", "z"], ["x", "y"]]}, "`position`"),
-    (
-        TABLE,
-        {"kinds": ["revolute"]},
-        "`joints`: expected 1 columns, one for each of `kinds` ... got 2 (['q1', 'q2'])",
-    ),
+    (TABLE, {"kinds": ["revolute"]}, "`joints`: expected 1 columns, one for each of `kinds` ... got 2 (['q1'"),
     (TABLE, {"kinds": ["revolute", "planar"]}, "`kinds` ... 'prismatic' ... got 'planar'"),
     (TABLE, {"joint_length": "m"}, "`joint_length` without the kinds of the joints ... pass the robot, or `kinds`"),
     (TABLE, {"camera_on_tool": True}, "`camera_on_tool` without `rotation`; name the columns"),
 ]
 
-# --- poses and deviations -------------------------------------------------------------------------------------------
 
 POSED: dict[str, Any] = {"rotation": ["a", "b", "c"], "convention": "XYZ", "rotation_angle": "deg"}
 POSE_HEADER, POSE_ROW = "q1,q2,x,y,z,a,b,c,d\n", "0.1,0.2,1.0,2.0,3.0,10,20,30,1\n"
@@ -99,46 +85,27 @@ POSES: list[Case] = [
     (POSE, {"rotation_angle": None}, "`rotation_angle` is missing ... expected 'rad' or 'deg'"),
     (POSE, {"rotation_angle": "grad"}, "`rotation_angle`: expected 'rad' or 'deg', got 'grad'"),
     (POSE, {"convention": "roll-pitch-yaw"}, "`convention` ... got 'roll-pitch-yaw'"),
-    (POSE, {"rotation": ["a", "b"]}, "`rotation`: expected 3 names of columns for 'XYZ', got ['a', 'b']"),
-    (POSE, {"rotation": [1, 2, 3]}, "`rotation` ... got [1, 2, 3]"),
-    (POSE, QUATERNION | {"rotation": ["a"]}, "`rotation`: expected 4 names of columns for 'quat_xyzw'"),
     (POSE, QUATERNION | {"rotation_angle": "deg"}, "`rotation_angle` beside convention 'quat_xyzw' ... leave it out"),
-    (
-        POSE,
-        QUATERNION,
-        "line 2, columns a, b, c, d: expected a quaternion of length 1 ... got 37.4299 ... order of the",
-    ),
+    (POSE, QUATERNION, "line 2, columns a, b, c, d: expected a quaternion of length 1 ... got 37.4299 ... order"),
     (POSE, QUATERNION | {"rotation_std": ["u", "v", "w"]}, "`rotation_angle` is missing"),
     (POSE, {"rotation": ["a", "b", "x"]}, "distinct columns, got ['x'] twice"),
-    (
-        POSE,
-        {"position": TWO, "rotation": ["q1"] * 3},
-        "`rotation`: expected a list for each position",
-    ),
+    (POSE, {"position": TWO, "rotation": ["q1"] * 3}, "`rotation`: expected a list for each position"),
     (POSE, {"rotation": [["a", "b", "c"], ["a", "b"]]}, "`rotation`: expected 3 names ... got ['a', 'b']"),
     (POSE, {"std": ["d", "q1"]}, "`std`: expected ... one per marker ... got ['d', 'q1']"),
     (POSE, {"std": ["a"]}, "distinct columns, got ['a'] twice"),
     (
         POSE,
         NO_ROTATION | {"spherical": "zenith_gon", "std": ["a", "b", "c"]},
-        "`std` of a distance and two angles: got ['a', 'b', 'c']; name one",
+        "`std` of a distance and two angles: got",
     ),
     (POSE, {"rotation_std": ["d", "e"]}, "`rotation_std` ... three, or one for all three axes, got ['d', 'e']"),
     (POSE, {"rotation_std": ["d", "d", "d"]}, "distinct columns, got ['d'] twice"),
-    (
-        POSE,
-        {"rotation_std": [["d"], ["e", "f", "g"]]},
-        "`rotation_std`: expected as many names for every frame, got 1 and 3",
-    ),
+    (POSE, {"rotation_std": [["d"], ["e", "f", "g"]]}, "`rotation_std`: expected as many names ... got 1 and 3"),
     (POSE + "0,0,1,2,3,10,,30,1\n", {}, "line 3, column 'b' ... an empty cell"),
     (POSE + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, "line 4, column 'd' ... got '0'"),
     (MATRICES + ",1,0,0,0,1,0,0,0,-1\n", MATRIX, "line 3, columns r0, r1 ... mirrored"),
     (MATRICES + ",2,0,0,0,2,0,0,0,2\n", MATRIX, "line 3 ... orthonormal ... without a scale"),
-    (
-        POSE.replace("a,b,c", ",".join(RAD)),
-        {"rotation": RAD},
-        "column 'a [rad]': expected deg, as stated, got rad in the",
-    ),
+    (POSE.replace("a,b,c", ",".join(RAD)), {"rotation": RAD}, "column 'a [rad]': expected deg, as stated, got rad"),
 ]
 FRAMES: dict[str, Any] = {
     "rotation": [["a", "b", "c"], ["A", "B", "C"]],
@@ -155,7 +122,6 @@ SEVERAL: list[Case] = [
     (ONE_FRAME, {}, "columns x, y, z, a, b and 1 more ... shows this frame; leave them out"),
 ]
 
-# --- hidden markers -------------------------------------------------------------------------------------------------
 
 PAIR: dict[str, Any] = {"position": [("ax", "ay", "az"), ("bx", "by", "bz")]}
 MARKERS = "q1,q2,ax,ay,az,bx,by,bz\n0.1,0.2,1,2,3,4,5,6\n0.3,0.4,1.5,2.5,3.5,,,\n0.5,0.6,,,,4.5,5.5,6.5\n"
@@ -219,8 +185,6 @@ def test_files_that_cannot_be_opened_and_units_that_are_not_named(tmp_path: Path
         with pytest.raises(TypeError, match=name):
             read_measurements(tmp_path, JOINTS, POSITION, **{other: units[other] for other in units if other != name})
 
-
-# --- several kinds --------------------------------------------------------------------------------------------------
 
 SI = TableFormat("m", "rad", joints=("a", "b"))
 LINES = """a,b,x,y,z,d,u,v,spot,who,sd

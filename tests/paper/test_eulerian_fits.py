@@ -1,6 +1,5 @@
 """Fits in the paper's formulation: its algorithms, gradient descent, and what it does not support."""
 
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -68,20 +67,6 @@ def test_algorithm_1_is_gradient_descent_from_zero() -> None:
     assert not result[1].requires_grad
     settled = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e6, 12))
     assert not bool(settled[1].any())  # the tolerance is met at once
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("formulation", "step", "tolerance"), [("exact", 0.15, 1e-3), ("eulerian", 0.05, 3e-3)])
-def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tolerance: float) -> None:
-    problem = few_points()
-    solver = dc.GradientDescent(step=step, tolerance=tolerance, max_iterations=300)
-    fit = dc.fit(problem, solver, dc.RK4(1), formulation=formulation)  # pyright: ignore[reportArgumentType]
-    best = dc.fit(problem, dc.LBFGS(max_iterations=40), dc.RK4(1), formulation=formulation)  # pyright: ignore[reportArgumentType]
-    assert fit.converged
-    assert fit.status.startswith("converged: gradient")
-    assert fit.energy == pytest.approx(best.energy, rel=2e-3)
-    assert all(after <= before for before, after in pairwise(fit.history))
-    assert fit.history[0] == pytest.approx(float(problem.energy(problem.deform(problem.zero(), dc.RK4(1))).total))
 
 
 @pytest.mark.parametrize(("formulation", "step"), [("exact", 100.0), ("eulerian", 1e30)])

@@ -1,8 +1,4 @@
-"""Every way to condition on the data, against the formula written out with dense matrices and against each other.
-
-The reference adds up G from the kernels' full matrices, for every node and marker. Then the choice between the ways,
-and the memory that they need.
-"""
+"""Every way to condition on the data, against the formula written out with dense matrices and against each other."""
 
 from collections.abc import Callable
 from dataclasses import replace

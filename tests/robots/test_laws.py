@@ -180,10 +180,7 @@ def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: flo
 
 
 def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) -> Tensor:
-    """e . sum (o_f - o_l) x m_f g over what the joint moves on the ground, by a second derivation: potential energy.
-
-    The moment is minus the derivative of the masses' potential energy by a turn of everything that the joint carries.
-    """
+    """e . sum (o_f - o_l) x m_f g over what the joint moves on the ground, by a second derivation: potential energy."""
     ground = robot.ground_place
     places = robot.places(q)
     places = places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places

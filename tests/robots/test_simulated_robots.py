@@ -1,6 +1,5 @@
 """Simulated robots: the planar test bed against its published numbers, the arm against its known errors."""
 
-from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -26,26 +25,6 @@ def test_error_of_the_nominal_model() -> None:
     error = (elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1)
     assert float(error.mean()) == pytest.approx(0.108, abs=5e-4)
     assert float(error.max()) == pytest.approx(0.184, abs=5e-4)
-
-
-def test_hanging_straight_down_the_arm_only_stretches() -> None:
-    x = torch.tensor([[-pi / 2, 0.0]], dtype=torch.float64)
-    stretched = 1.08 * (1 + 2 / 200) + 0.46 * (1 + 1 / 200)
-    expected = torch.tensor([[0.04, -0.03 - stretched]], dtype=torch.float64)
-    torch.testing.assert_close(elastic_rr.real(x), expected, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("k0", [elastic_rr.nominal, elastic_rr.real])
-def test_smooth_and_periodic(k0: Callable[[torch.Tensor], torch.Tensor]) -> None:
-    x = uniform(5)
-    turns = torch.tensor([2 * pi, -4 * pi], dtype=torch.float64)
-    torch.testing.assert_close(k0(x + turns), k0(x), rtol=0, atol=1e-13)
-    assert torch.autograd.gradcheck(k0, (x.requires_grad_(),))
-    each = torch.func.vmap(torch.func.jacrev(lambda z: k0(z[None])[0]))(x.detach())
-    both = torch.func.vmap(torch.func.jacfwd(lambda z: k0(z[None])[0]))(x.detach())
-    torch.testing.assert_close(each, both)
-    with pytest.raises(InputError, match=r"`x` has the wrong shape: expected \(N, 2\), got \(4, 3\)"):
-        k0(torch.zeros(4, 3))
 
 
 def test_gravity_torques_agree_with_pinocchio(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ UNCHOSEN_FACTOR = 9.0
 # three and six numbers.
 MEDIAN_EFFICIENCY = 0.5
 REMAINING_ERROR = 0.2  # largest part of a row's error that may remain with an explanation that is named
+MOST_MASSES = 10  # payloads up to which each is a label
 # Factor by which an error must exceed what the model's deviations exclude, outside of the rows of its fit.
 OVERCONFIDENT = 3.0
 # Share of wrong rows in a block, fewest of them, and the chance that rows spread at random look like one.
