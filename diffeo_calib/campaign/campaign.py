@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil, inf, log
+from threading import Thread
 from typing import Any
 
 import torch
@@ -28,7 +29,8 @@ from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
-FIRST_ROWS = 12  # accepted rows of the first model
+FIRST_ROWS = 12
+"""Accepted rows of the first model."""
 ROWS_GROWTH_PER_MODEL, WAITING_GROWTH, TOGETHER = 1.5, 2.5, 24
 """Factor by which the accepted rows grow between two models, and between those while more rows wait; most rows that are
 judged together."""
@@ -38,7 +40,8 @@ NEAR, NEAR_GROWTH = 1.5, 1.15
 """Expected error, relative to the goal, from which on scales are selected more often, and the factor there."""
 CANDIDATES, TARGETS = 120, 40
 """Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
-SAME_POSE = 5e-3  # largest difference of a joint between a pose and its repeat, rad or m
+SAME_POSE = 5e-3
+"""Largest difference of a joint between a pose and its repeat, rad or m."""
 MOST_STEPS, MOST_ROWS = 60, 10_000
 """Poses that a forecast chooses, beyond which the variance is extrapolated as a power of their number; most of them."""
 
@@ -72,6 +75,8 @@ class Campaign:
             near the rows so far where a camera sees its board or the ball rests in a socket. Others are never proposed.
         target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
         goal: RMS error over the target to reach, m, see :attr:`reached`.
+        background: whether models are renewed in a thread of their own: a call then never waits for one, and verdicts
+            depend on when it ends. By default a call that is due for a new model makes it (some seconds).
         seed: of everything that is drawn.
 
     Attributes:
@@ -83,14 +88,21 @@ class Campaign:
     """
 
     def __init__(
-        self, robot: Tree, *, candidates: object = None, target: object = None, goal: float | None = None, seed: int = 0
+        self,
+        robot: Tree,
+        *,
+        candidates: object = None,
+        target: object = None,
+        goal: float | None = None,
+        background: bool = False,
+        seed: int = 0,
     ) -> None:
         if not isinstance(robot, Tree):
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__)
         if goal is not None:
             check_number(goal, "`goal`", above=0.0)
         self.goal = goal
-        self.robot, self.seed = robot, check_seed(seed)
+        self.robot, self.seed, self.background = robot, check_seed(seed), background
         self._draws = candidates is None
         self.candidates = drawn(robot, CANDIDATES, seed=seed) if candidates is None else _joints(robot, candidates)
         self.target = self.candidates if target is None else _joints(robot, target)
@@ -99,6 +111,8 @@ class Campaign:
         self.models = 0
         self._lines: list[int] = []
         self._model: CampaignModel | None = None
+        self._made: list[CampaignModel] = []
+        self._maker: Thread | None = None
         self._tried = self._waiting = 0
         self._obstacle = ""  # why there is no first model
 
@@ -216,8 +230,15 @@ class Campaign:
         q = torch.cat([self.table.q[again], proposal.q])[:count]
         return replace(proposal, q=q, rows=proposal.rows[: count - len(again)], again=again)
 
+    def wait(self) -> None:
+        """Wait for a model that is made in the background."""
+        if self._maker is not None:
+            self._maker.join()
+        self.poll()
+
     def _add(self, whole: Any, waiting: int) -> None:
         """Judge some rows of a table, and renew the model if it is due."""
+        self.poll()
         row, most = len(self), ceil(min(TOGETHER, self._due - len(self.accepted)))
         self.table = whole.rows(slice(0, min(len(whole), row + max(1, most) if self._model else row + 1)))
         if self._model is None:
@@ -245,10 +266,26 @@ class Campaign:
             raise InputError.of("`row`", expected=f"0 to {len(self) - 1}", got=str(row))
         before = self.verdicts[row]
         self.verdicts[row] = replace(before, accepted=accepted, decided=True, again=again)
-        if before.accepted != accepted and self._model is not None:
-            names, placed = self.table.device_names, self._model.around.placed.data.device_names
-            some = sum(names[row] in placed for row in self.accepted) > 1  # which a model holds at least
-            self._model = self._model.rebuilt(self.table, self.verdicts) if some else None
+        if before.accepted != accepted:
+            self.wait()
+            if self._model is not None:
+                names, placed = self.table.device_names, self._model.around.placed.data.device_names
+                some = sum(names[row] in placed for row in self.accepted) > 1  # which a model holds at least
+                self._model = self._model.rebuilt(self.table, self.verdicts) if some else None
+
+    def _renew(self) -> None:
+        """Make a new model if it is due."""
+        count = len(self.accepted)
+        if count < self._due or count == self._tried or self._maker is not None:
+            return
+        self._tried = count
+        arguments = self.table, list(self.verdicts)
+        if self.background:
+            self._maker = Thread(target=self._make, args=arguments, daemon=True)
+            self._maker.start()
+        else:
+            self._make(*arguments)
+            self.poll()
 
     @property
     def _due(self) -> float:
@@ -266,35 +303,55 @@ class Campaign:
         near = self.goal is not None and model.expected_error < NEAR * self.goal
         return max((NEAR_GROWTH if near else SCALES_GROWTH) * model.around.selected, FIRST_SCALES)
 
-    def _renew(self) -> None:
-        """Make a new model if it is due."""
-        count = len(self.accepted)
-        if self._due <= count != self._tried:
-            self._tried = count
-            self._make()
-
     @small_work()
-    def _make(self) -> None:
-        """Make a model of the accepted rows; the old one stays where they do not allow it."""
-        numbers, old = self.accepted, self._model
-        count, first = len(numbers), len(numbers) < FIRST_SCALES
-        same = None if old is None or count >= self._next_scales(old) else old
+    def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
+        """A new model from accepted rows; without one if they do not allow it yet."""
+        numbers, old = [verdict.row for verdict in verdicts if verdict.accepted], self._model
+        first = len(numbers) < FIRST_SCALES
+        same = None if old is None or len(numbers) >= self._next_scales(old) else old
         asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
         try:
             kept = same and same.around
-            around = Around.of(self.robot, self.table.rows(numbers), asked, kept, first=first, seed=self.seed)
+            around = Around.of(self.robot, table.rows(numbers), asked, kept, first=first, seed=self.seed)
             around = around.with_open_candidates(CANDIDATES, self.seed) if self._draws else around
             around = around if same or first or self.goal is None else around.with_deviation()
-            made = CampaignModel(around, self.table, self.verdicts, same.ratios if same else ())
+            made = CampaignModel(around, table, verdicts, same.ratios if same else ())
             if old is None:
                 made.check_placed()
         except DiffeoCalibError as error:
             self._obstacle = str(error)
             return
-        if old is None:
-            self.verdicts = [replace(one, cause="") if one.fits is None else one for one in self.verdicts]
-        self.candidates, self._model = around.candidates, made
+        self.candidates = around.candidates
         self.models += 1
+        self._made.append(made)
+
+    @small_work()
+    def poll(self) -> bool:
+        """Put a model that was made in the background in the place of the old one; whether there was one.
+
+        Rows that came before there was a model are judged by it.
+        """
+        if self._maker is not None and not self._maker.is_alive():
+            self._maker = None
+        if self._made:
+            if self._model is None:
+                self.verdicts = [replace(one, cause="") if one.fits is None else one for one in self.verdicts]
+            self._model = self._caught_up(self._made.pop())
+            self._renew()
+            return True
+        return False
+
+    def _caught_up(self, made: CampaignModel) -> CampaignModel:
+        """A new model with the rows that came since its last one: those that no model has judged are judged by it."""
+        late = next((verdict.row for verdict in self.verdicts[made.seen :] if verdict.fits is None), None)
+        if late is not None:
+            made = made.rebuilt(self.table.rows(slice(0, late)), self.verdicts[:late])
+            before, self.verdicts = self.verdicts, self.verdicts[:late]
+            for old in before[late:]:
+                self._judge(made, self.table.rows(slice(0, old.row + 1)))
+                kept = {"accepted": old.accepted, "decided": True, "again": old.again} if old.decided else {}
+                self.verdicts[old.row] = replace(self.verdicts[old.row], expected_error=old.expected_error, **kept)
+        return made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
 
     def _judge(self, model: CampaignModel, table: Any) -> None:
         """Add the verdict about the last row of a table."""

@@ -227,14 +227,14 @@ class CampaignModel:
         around: places and scales. table: all rows. verdicts: on them. ratios: of accepted rows, see :attr:`typical`.
 
     Attributes:
-        window: numbers of the last rows; ``numbers`` and
+        seen: rows of the campaign when this was made. window: numbers of the last rows; ``numbers`` and
             ``noise`` are what these tell.
         process: what is known by the accepted rows but the last ones. now: by all of them.
         covariance: (T r, T r) of the errors over the target, m^2.
     """
 
     def __init__(self, around: Around, table: Any, verdicts: Sequence[Verdict], ratios: Sequence[float]) -> None:
-        self.around, self.ratios = around, list(ratios)
+        self.around, self.seen, self.ratios = around, len(table), list(ratios)
         placed, names = set(around.placed.data.device_names), table.device_names
         judged = [verdict for verdict in verdicts if names[verdict.row] in placed]
         accepted = [verdict.row for verdict in judged if verdict.accepted]

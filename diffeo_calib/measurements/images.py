@@ -206,14 +206,11 @@ class ImageTable(RowGroups):
 
     def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
         """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ."""
-        pairs = [(camera, cameras.get(name)) for name, camera in self.cameras.items()]
-        if self.corners is None or not pairs or not all(old is not None and camera.alike(old) for camera, old in pairs):
+        known = {name: cameras[name] for name in self.cameras if name in cameras}
+        if not known or any(name not in known or not own.alike(known[name]) for name, own in self.cameras.items()):
             return self
-        known = {name: cameras[name] for name in self.cameras}
-        names, on_tool = self.camera_names, self.board is not None
-        again = self.from_images(
-            self.q, self.corners, known, self.joint_names, seen_by=names, camera_on_tool=on_tool, doubt=False
-        )
+        how = {"seen_by": self.camera_names, "camera_on_tool": self.board is not None, "doubt": False}
+        again = self.from_images(self.q, self.corners, known, self.joint_names, **how)
         columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
         columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
         return with_attributes(self, **columns)

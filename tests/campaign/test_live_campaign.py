@@ -68,6 +68,18 @@ def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign, mea
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
+def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[:18].clone() for part in measured)
+    y[15] += 50 * MM
+    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(20, seed=8), background=True)
+    campaign.add(q, y)
+    campaign.repeat(17)
+    campaign.wait()
+    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
+    assert [one.row for one in campaign.verdicts if not one.accepted] == [15, 17]
+    assert [one.row for one in campaign.verdicts if one.again] == [17]
+
+
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (part[ROWS : ROWS + 1] for part in measured)
     before = measured[0][ROWS - 1]
@@ -246,3 +258,22 @@ def test_the_limit_holds_95_percent_of_errors() -> None:
     limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
     assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
     assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
+
+
+def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
+    campaign: Any = copy.deepcopy(running)
+    known, limit = campaign.expected_error, campaign.error_limit
+    assert 1.1 < limit / known < 2
+    for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
+        campaign.goal = goal
+        assert campaign.reached == (needed == 0)
+        assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
+        assert needed is None or campaign.next(1).needed == needed
+    campaign._make(campaign.table, campaign.verdicts)  # around all rows, with the same scales
+    campaign.poll()
+    assert (campaign._model.count, campaign._next_scales(campaign._model)) == (ROWS, pytest.approx(2.0 * 20))
+    assert 1.1 < campaign.error_limit / campaign.expected_error < 2
+    few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
+    assert few.expected_error is not None
+    assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"

@@ -137,16 +137,13 @@ def typical_noise(noise: Noise) -> Tensor:
 
     If no row does, the blocks of median size of every marker, as if their errors were independent.
     """
-    whole = noise.visible.all(1)
-    if bool(whole.any()):
-        return _of_median_size(noise.covariance[whole])
-    blocks, visible = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
-    return torch.block_diag(*[_of_median_size(blocks[visible[:, k], k]) for k in range(visible.shape[1])])
-
-
-def _of_median_size(blocks: Tensor) -> Tensor:
-    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
-    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
+    blocks, shown = noise.covariance[:, None], noise.visible.all(1, keepdim=True)
+    if not bool(shown.any()):
+        shown = noise.visible[:, ::3]
+        blocks = own_blocks(noise.covariance, shown.shape[1])
+    sizes = blocks.diagonal(dim1=2, dim2=3).sum(2).masked_fill(~shown, nan)
+    typical = (sizes == sizes.nanmedian(0).values).long().argmax(0)
+    return torch.block_diag(*[blocks[row, k] for k, row in enumerate(typical.tolist())])
 
 
 NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")

@@ -102,14 +102,13 @@ def _placed(
     open_[:6] = open_[:6].clamp(max=PLACES.found_m_rad)
     if new.marker == "same":
         open_[6:], marks = open_[6:].bool() * PLACES.same_m, FlangePoints(marks.fitted, new.old_markers, same=True)
-    together = replace(new, marks=marks, deviations=open_)
-    problem, start = both_dates(together, new.inflation)  # as if nothing but places had changed
+    together, factor = replace(new, marks=marks, deviations=open_), new.changed(deviations=open_).inflation
+    problem, start = both_dates(together, factor)  # as if nothing but places had changed
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
     learnt = problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
-    short = fit.inflated(new.inflation).unresolved
-    learnt = replace(moved(learnt, registration.transform), new_noise=registration.noise, unresolved=short)
+    learnt = replace(moved(learnt, registration.transform), unresolved=fit.inflated(factor).unresolved)
     markers = fitted_markers(learnt)
     return learnt, replace(registration, markers=markers, shift=markers - new.old_markers)
 
@@ -214,22 +213,15 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[Extrinsics] = ()) -> 
         sensor_of(part).check(part, model)
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for placed in sensor_of(part).settled(part, points, model.turns):
-            new = _with_rows(placed, fitted)
+            new, other = placed, next((each for each in fitted if each.same_set(placed)), None)
+            if other is not None and not new.set_up:
+                number = torch.tensor([new.names.index(name) for name in other.names], dtype=torch.int64, device=HOST)
+                other = replace(new, rows=other.rows, device=number[other.device])
+            new = new if other is None else other
             same = next((number for number, old in enumerate(devices) if new.same_set(old)), len(devices))
             alone = [] if new.set_up and len(new.names) == 1 else [new]
             devices[same : same + 1] = [new.beside(old) for old in devices[same : same + 1]] or alone
     return tuple(devices)
-
-
-def _with_rows(devices: Extrinsics, fitted: Sequence[Extrinsics]) -> Extrinsics:
-    """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
-    for other in fitted:
-        if other.same_set(devices) and devices.set_up:
-            return other
-        if other.same_set(devices):
-            number = torch.tensor([devices.names.index(name) for name in other.names], dtype=torch.int64, device=HOST)
-            return replace(devices, rows=other.rows, device=number[other.device])
-    return devices
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[Extrinsics, ...]:

@@ -56,6 +56,7 @@ class Live:
     ids: dict[str, int] = field(default_factory=dict)  # number of the line of each id
     unreadable: dict[int, str] = field(default_factory=dict)  # lines that are no rows, and why
     revised: list[int] = field(default_factory=list)  # rows that the last line changed
+    late: list[int] = field(default_factory=list)  # rows that a new model changed, not told yet
     _found: tuple[object, Next | None] | None = None
 
     def __post_init__(self) -> None:
@@ -144,6 +145,17 @@ class Live:
                 self.waiting = [*lines[start + TOGETHER :]]
                 return
 
+    def poll(self) -> bool:
+        """Say what a model that was made in the background changes; whether there was one."""
+        if not self.campaign.poll():
+            return False
+        self.journal.add(self._revised())
+        self.late += self.revised
+        if not self.given.stdin:  # those who send rows get one answer for each
+            changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
+            self._say(({"text": changed} if changed else {}) | self.state())
+        return True
+
     def take(self, entry: Entry | DiffeoCalibError) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
         answer: Entry = {}
@@ -157,6 +169,7 @@ class Live:
             elif entry:
                 number = self.known(entry)
                 answer = self.answer(self._append(entry) if number is None else number) | answer
+            self.poll()
             answer |= self.state()
         except InputError as error:
             answer["error"] = str(error)
@@ -248,7 +261,7 @@ class Live:
             return answer | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
         of_line = [verdict for verdict in every if verdict.line == number + 2]
         answer = of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line))}
-        revised, self.revised = self.revised, []
+        revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
         return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
 
     def _say(self, answer: Entry) -> None:
@@ -344,6 +357,7 @@ def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | Non
                 break
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    live.campaign.wait()
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
@@ -355,13 +369,14 @@ def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[boo
     while True:
         lines = live.new_lines()
         live.judge(lines)
+        live.campaign.background = not given.once  # rows that were there before are judged one after the other
         yield bool(lines)
         if given.once and not lines:
             return
         try:
             sent = inbox.get(timeout=LOOK_SECONDS)
         except Empty:
-            yield False
+            yield live.poll()
             continue
         if sent is None:
             return
