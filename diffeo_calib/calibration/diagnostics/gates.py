@@ -107,7 +107,6 @@ NEVER_MOVED_M = 1e-6  # spread of the markers below which they stand still: no d
 # UR10 leaves 0.001, a wrong tip link 0.1. The same, from which it is warned about without another reading; noise of 1 %
 # of the reach leaves 0.03.
 REGISTERED_RESIDUAL, GEOMETRIC_RESIDUAL, UNEXPLAINED_RESIDUAL = 0.25, 0.02, 0.05
-ROUGH_PER_REACH = 3e-3  # residual, in the tip's distance from the base, that a rough device leaves of a right table
 FIXED_RANGE, SMALL_RANGE = 1e-3, 0.05  # range, rad or strokes of at most 1 m, of a joint that never, or hardly, moved
 # Largest plausible orientation error after the geometric calibration, and the share of poses that may exceed it.
 ORIENTATION_RAD, ORIENTATION_SHARE = 0.1, 0.1
