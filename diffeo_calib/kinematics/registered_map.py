@@ -51,10 +51,8 @@ from diffeo_calib.regression.conditional import Conditional, Estimated
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.set_ups import frame_slopes
 
-LARGE_EXCESS = 3.0
-"""Residuals by this factor above the expected ones mean that something else has changed too."""
-EXCHANGED_SHARE = 0.1
-"""Distance from the old place of another marker, relative to that from its own, from which a marker is that one."""
+LARGE_EXCESS = 3.0  # residuals by this factor above the expected ones mean that something else has changed too
+EXCHANGED_SHARE = 0.1  # distance to another marker's old place, relative to that from its own, of exchanged ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,10 +289,8 @@ def check_isotropic(kernel: Kernel) -> None:
             raise InputError.of(f"{what}: the model cannot be moved to another frame", fix=fix)
 
 
-WELL_KNOWN_M = 1e-4
-"""Smaller deviations are never named, whatever the noise."""
-HARDLY = 10.0
-"""A direction is hardly determined if its deviation is so many times that of a predicted row."""
+WELL_KNOWN_M = 1e-4  # smaller deviations are never named, whatever the noise
+HARDLY = 10.0  # a direction is hardly determined if its deviation is so many times that of a predicted row
 SPREAD, TURN = "spread the poses over the workspace", "turn the tool about several axes between the poses"
 
 

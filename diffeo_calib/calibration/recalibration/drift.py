@@ -29,12 +29,9 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 
-SMALLEST_AMPLITUDE_SHARE = 0.5
-"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
-OFFSET_DEVIATION_RAD_M = 3e-4
-"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE_EIGENVALUE_SHARE = 1e-5
-"""Eigenvalues of a part's covariance below this share of the largest are left out."""
+SMALLEST_AMPLITUDE_SHARE = 0.5  # of the largest joint's amplitude: a smaller transmission error may have grown
+OFFSET_DEVIATION_RAD_M = 3e-4  # of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad
+NEGLIGIBLE_EIGENVALUE_SHARE = 1e-5  # eigenvalues of a part's covariance below this share of the largest are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +122,9 @@ def parts_of(fitted: FittedMap) -> list[ChangedPart]:
 USUAL_LOG, NAMED_LOG, EFOLDS, ALIKE_EFOLDS = -6.0, 0.0, 2.5, 1.5
 """Of the priors of s^2: logarithms of the centres of what usually differs and of what is named, the standard deviation
 of all, and that of geometry, load and transmissions around their mean."""
-LOG_SIZES = torch.linspace(-12.0, 6.0, 37, dtype=torch.float64, device="cpu")
-"""Logarithms of the s^2 that are tried."""
-NOTHING, ROUNDS = -60.0, 3
-"""That of what does not differ; rounds of a search for one size after the other."""
-WRONG_SHARE = 0.05
-"""Probability that a row is wrong, before it is seen."""
+LOG_SIZES = torch.linspace(-12.0, 6.0, 37, dtype=torch.float64, device="cpu")  # logarithms of the s^2 that are tried
+NOTHING, ROUNDS = -60.0, 3  # that of what does not differ; rounds of a search for one size after the other
+WRONG_SHARE = 0.05  # probability that a row is wrong, before it is seen
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,8 +41,7 @@ from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
-LEVEL = 0.01
-"""Probability that anything is named although nothing has changed."""
+LEVEL = 0.01  # probability that anything is named although nothing has changed
 
 
 @dataclass(frozen=True)
@@ -145,10 +144,8 @@ class Changes:
 
 
 SIMULATED_DRAWS = 2000
-NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
-"""Factors 0.4 to 12 on the variance of the noise: another device, another day."""
-SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)
-"""Variances 0.03 to 300 of a change, relative to the old variance of its part."""
+NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)  # on its variance
+SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)  # relative to old variances
 
 
 class Ratio(NamedTuple):
@@ -208,12 +205,9 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
 
 
 FEWEST_ROWS = 5
-MOST_OUTLIERS = 0.5
-"""Share of the rows of a session that hardly count, from which it deviates as a whole."""
-RANGE_MARGIN = 0.02
-"""Rows may lie outside of the old joint ranges by this share of them."""
-SOMETHING = "something"
-"""A change whose part rows do not tell."""
+MOST_OUTLIERS = 0.5  # share of the rows of a session that hardly count, from which it deviates as a whole
+RANGE_MARGIN = 0.02  # rows may lie outside of the old joint ranges by this share of them
+SOMETHING = "something"  # a change whose part rows do not tell
 
 
 def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[ChangedPart]]:
@@ -310,10 +304,8 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
     return Changes(changes, first, noise, len(rows), level, tuple(smallest)), drifts
 
 
-SHOWN = 5.5
-"""Standard deviations of an offset that is named in nine cases of ten at a level of 1 %."""
-LARGEST_OFFSET_RAD_M = 5e-3
-"""The largest one that is tested, see SIZES."""
+SHOWN = 5.5  # standard deviations of an offset that is named in nine cases of ten at a level of 1 %
+LARGEST_OFFSET_RAD_M = 5e-3  # the largest one that is tested, see SIZES
 
 
 def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[str, ...]) -> Change:
@@ -332,8 +324,7 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
     return Change(part.name, size, angle, displacement, probability, deviation, others)
 
 
-RANK_TOLERANCE = 1e-9
-"""Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
+RANK_TOLERANCE = 1e-9  # smallest eigenvalue of correlations, relative to the largest, that is not rounding
 
 
 def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Offset, ...]:

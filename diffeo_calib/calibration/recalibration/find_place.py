@@ -55,18 +55,12 @@ MARKER_DEVIATIONS = {
 }
 """Prior standard deviations, m, of markers from where they were, in a registration, and from where it found them."""
 OTHER_MARKER = MARKER_DEVIATIONS["other"][0]
-UNMOVED_LOG_ODDS = log(10.0)
-"""Before the rows are seen: markers that nobody names as moved have not been touched."""
-MOST_ROWS = 200
-"""Of more rows, so many evenly spaced ones take part."""
-BEYOND_REACH = 10.0
-"""Distance of rows from their middle, in reaches of the robot or m, from which their unit is wrong."""
-LARGEST_OUTLIER_PART = 0.34
-"""Largest part of the rows that are taken for outliers."""
-NEGLIGIBLE_PROBABILITY = 0.01
-"""Priors that are less probable count no more."""
-LEAST_POINTS = 3
-"""Points that determine where a frame is."""
+UNMOVED_LOG_ODDS = log(10.0)  # before the rows are seen: markers that nobody names as moved have not been touched
+MOST_ROWS = 200  # of more rows, so many evenly spaced ones take part
+BEYOND_REACH = 10.0  # distance of rows from their middle, in reaches of the robot or m, from which their unit is wrong
+LARGEST_OUTLIER_PART = 0.34  # largest part of the rows that are taken for outliers
+NEGLIGIBLE_PROBABILITY = 0.01  # priors that are less probable count no more
+LEAST_POINTS = 3  # points that determine where a frame is
 
 
 def find_place(
@@ -282,10 +276,8 @@ def _refuse_others(away: Tensor, most: float) -> float:
     return typical
 
 
-PRIOR_FREEDOM = 10.0
-"""The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
-FALSE_ALARM_PROBABILITY = 0.001
-"""Probability that clean rows have an outlier."""
+PRIOR_FREEDOM = 10.0  # the model's own covariance counts as an estimate of the scale with so many degrees of freedom
+FALSE_ALARM_PROBABILITY = 0.001  # probability that clean rows have an outlier
 
 
 def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | int = 0) -> tuple[Tensor, Tensor]:
@@ -379,8 +371,7 @@ def _rms(errors: Tensor) -> float:
     return float(errors.norm(dim=-1).square().nanmean().sqrt())
 
 
-UNLIKELY = 0.01
-"""Probability of what is said of the markers, below which it is warned of."""
+UNLIKELY = 0.01  # probability of what is said of the markers, below which it is warned of
 
 
 def warn_about(

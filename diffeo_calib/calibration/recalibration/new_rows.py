@@ -41,15 +41,11 @@ from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 MAX_STEPS = 100
-SMALL_STEP = 1e-2
-"""Below such a step of the markers, m, C hardly changes."""
-SETTLED = 1e-9
-"""The search for places ends with a step below this, m and rad."""
+SMALL_STEP = 1e-2  # below such a step of the markers, m, C hardly changes
+SETTLED = 1e-9  # the search for places ends with a step below this, m and rad
 ROUNDS = 20
-OUTLIER_WEIGHT = 0.2
-"""Rows with a smaller weight hardly count."""
-LINEARISED = "seen", "at", "residual", "by_places", "fit_covariance"
-"""Cached properties that neither noise nor priors change."""
+OUTLIER_WEIGHT = 0.2  # rows with a smaller weight hardly count
+LINEARISED = "seen", "at", "residual", "by_places", "fit_covariance"  # without noise and priors
 
 
 class UsualNoise(NamedTuple):

@@ -146,10 +146,8 @@ def typical_noise(noise: Noise) -> Tensor:
     return torch.block_diag(*[blocks[row, k] for k, row in enumerate(typical.tolist())])
 
 
-NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
-"""Factors on the variance of the noise of devices that the old fit does not know."""
-NOISE_EFOLDS = 2.0
-"""Prior standard deviation of their logarithm: wide."""
+NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")  # factors on variances
+NOISE_EFOLDS = 2.0  # prior standard deviation of their logarithm: wide
 
 
 def _levelled(rows: NewRows) -> NewRows:
@@ -237,14 +235,11 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
 
 
 Marker = Literal["evidence", "same", "moved", "other"]
-LARGEST_TURN_RAD = 0.1
-"""Standard deviation of the turn of the measuring device from which its place is open."""
+LARGEST_TURN_RAD = 0.1  # standard deviation of the turn of the measuring device from which its place is open
 OTHER_UNIT = 0.5
 """Relative error of a thousand times the measured distances: markers that sit elsewhere lengthen and shorten them."""
-USUAL_RATIO = 3e-3
-"""Relative error of distances that no robot has."""
-FARTHEST_PAIRS = 0.5
-"""Of all pairs of rows, this part with the largest distances is compared."""
+USUAL_RATIO = 3e-3  # relative error of distances that no robot has
+FARTHEST_PAIRS = 0.5  # of all pairs of rows, this part with the largest distances is compared
 
 
 def check_arguments(model: object, new: object, marker: object) -> None:

@@ -65,12 +65,9 @@ from diffeo_calib.sensors.coordinates import mounted_of
 from diffeo_calib.sensors.errors import Evaluations
 
 LOG = logging.getLogger(__name__)
-CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
-"""Of a fit that the summary of a model has, too."""
-LARGEST_OUTLIER_PART = 0.5
-"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
-LARGEST_EXCESS = 10.0
-"""Residuals by this factor above the expected ones are not those of a worn joint."""
+CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"  # of a fit that the summary of a model has, too
+LARGEST_OUTLIER_PART = 0.5  # of the rows: with more of them it is not clear which are wrong
+LARGEST_EXCESS = 10.0  # residuals by this factor above the expected ones are not those of a worn joint
 
 
 @dataclass(frozen=True, repr=False)
@@ -258,12 +255,9 @@ def _result(
 
 # --- comparison ---
 
-MOST_PREDICTED = 60
-"""Configurations of two fits at which the models are compared."""
-MOST_USUAL = 100
-"""Rows of the fit that show how certain a model is there."""
-UNKNOWN_PER_USUAL = 5.0
-"""Expected errors of rows, relative to those at the rows of the fit, from which rows do not tell whether it changed."""
+MOST_PREDICTED = 60  # configurations of two fits at which the models are compared
+MOST_USUAL = 100  # rows of the fit that show how certain a model is there
+UNKNOWN_PER_USUAL = 5.0  # expected errors, in those at the rows of the fit, from which rows tell of no change
 
 
 @dataclass(frozen=True, repr=False)

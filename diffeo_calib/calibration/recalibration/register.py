@@ -44,10 +44,8 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind, with_points
 
 LOG = logging.getLogger(__name__)
-LARGEST_M_RAD = 0.03
-"""Deviation of a place, m or rad, from which its rows teach nothing about the robot: to first order they would."""
-STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
-"""The first one is within 2 % of the optimum, the second within 0.1 %."""
+LARGEST_M_RAD = 0.03  # deviation of a place, m or rad, from which its rows teach nothing about the robot
+STEPS = GaussNewton(max_iterations=2, tolerance=0.0)  # the first is within 2 % of the optimum, the second 0.1 %
 
 
 def registered(
