@@ -155,6 +155,8 @@ def test_deviations_of_readings() -> None:
     for std, said in ((0.0, "positive"), ([1.0, 2.0], "std"), (float("nan"), "std")):
         with pytest.raises(MeasurementError, match=said):
             Readings.heights(q, std=std)
+    with pytest.raises(MeasurementError, match=r"pass 2 per row\W*$"):  # pixels, no metres
+        Readings.images(q, values(3, 3), focal=(10.0, 20.0), centre=(1.0, 2.0))
 
 
 def test_positions_beside_images_are_readings_with_their_deviations() -> None:
