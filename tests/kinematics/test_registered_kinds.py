@@ -13,7 +13,7 @@ from kind_bank import ELSEWHERE, Kind, kind_named, marked
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.new_set_up import weighed
+from diffeo_calib.calibration.recalibration.register import weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import twist_transform

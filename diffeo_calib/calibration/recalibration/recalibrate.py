@@ -34,15 +34,17 @@ from diffeo_calib.calibration.recalibration.find_changes import (
 )
 from diffeo_calib.calibration.recalibration.find_place import OTHER_MARKER, find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
-from diffeo_calib.calibration.recalibration.new_set_up import (
+from diffeo_calib.calibration.recalibration.register import (
     Marker,
+    both_dates,
+    carried_devices,
     check_arguments,
     check_other_table,
+    devices_beside,
     knows_ball,
     place_again,
     weighed,
 )
-from diffeo_calib.calibration.recalibration.register import both_dates, carried_devices, devices_beside
 from diffeo_calib.calibration.result import parts
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
