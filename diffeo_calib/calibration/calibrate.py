@@ -29,6 +29,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, warn_of_taken_scales, worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge
 from diffeo_calib.calibration.diagnostics.judged_rows import (
+    Outlier,
     common_cause,
     flagged,
     outliers,
@@ -211,6 +212,17 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     return replace(fitted, advice=ADVICE, model=replace(fitted.model, unresolved=chosen.unresolved))
 
 
+def _common_cause(
+    model: CalibratedKinematics, placed: Placed, outlying: Sequence[Outlier], best: Finding | None
+) -> str | None:
+    """What explains rows that look wrong together, in a sentence: a change among the rows, or their order."""
+    said = best and best.text
+    if placed.coordinates is None:
+        return said
+    table, rows = placed.coordinates
+    return common_cause(model, table, flagged(len(placed.data), outlying)[rows.to(HOST)], said)
+
+
 def _result(
     robot: Tree,
     placed: Placed,
@@ -230,18 +242,15 @@ def _result(
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    least = gates.UNCHOSEN_FACTOR if len(data.x) < FEWEST_POSES else 1.0
+    chosen_scales = len(data.x) >= FEWEST_POSES  # beside defaults chance makes rows and lengths doubtful
+    least = 1.0 if chosen_scales else gates.UNCHOSEN_FACTOR
     explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
     warn_of_outliers(outlying, placed.data)
-    said = best and best.text
-    if placed.coordinates is not None:
-        table, rows = placed.coordinates
-        said = common_cause(model, table, flagged(len(data.x), outlying)[rows.to(HOST)], said)
-    if said:
+    if said := _common_cause(model, placed, outlying, best):
         warn_user(said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
-    found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
+    found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE)) if chosen_scales else []
     summary = Summary(
         **dict(zip(OF_POSITIONS, placed.stage_rms(model), strict=False)),
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,

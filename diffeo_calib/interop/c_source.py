@@ -163,7 +163,7 @@ def c_source(
     )
     flows = [_flow_constants(*flow) for flow in named if not flow[2].vanishes]
     terms = [term for flow in flows for term in flow["terms"]]
-    runs = (list(own) for _, own in groupby(range(len(program.on)), program.on.__getitem__))
+    runs = (list(run) for _, run in groupby(range(len(program.on)), program.on.__getitem__))
     contents = texts | {
         "stem": stem,
         "prefix": prefix,
@@ -174,7 +174,7 @@ def c_source(
         "lanes": LANES,
         "on_path": nominal.ancestors[len(nominal.axes) :][: len(chain.tips)] * 1,
         # markers of one tip that follow one another: tip, first and number
-        "groups": [(program.on[own[0]], own[0], len(own)) for own in runs],
+        "groups": [(program.on[run[0]], run[0], len(run)) for run in runs],
         "program": program,
         "flows": flows,
         "flow_names": [flow["name"] for flow in flows],

@@ -101,8 +101,8 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
 
 def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(N,) which configurations took no part in the fit, nor in a registration."""
-    known = rows_used_in_fit(model, q)
-    return ~(known if model.registration is None else known | repeats(q, model.registration.q)).to(HOST)
+    used = rows_used_in_fit(model, q)
+    return ~(used if model.registration is None else used | repeats(q, model.registration.q)).to(HOST)
 
 
 def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
+from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.robots import Chain, Geometry, Joint, from_dh
 from diffeo_calib.robots.gravity import GravitySag
 
@@ -119,6 +120,15 @@ def test_a_wave_turns_its_joint_and_nothing_else() -> None:
     for k, (joint, w) in enumerate(waves):
         turned[:, joint] += c[2 * k] * (w * x[:, joint]).cos() + c[2 * k + 1] * (w * x[:, joint]).sin()
     assert_close(with_waves(x, torch.cat([theta, c])), plain(turned, theta), rtol=0, atol=1e-14)
+
+
+def test_waves_are_added_to_what_kernels_and_axes_turn_a_joint_by() -> None:
+    chain, deformation = CHAINS["arm"], deformation_of(CHAINS["arm"], waves=True)
+    values, name = draw(9, seed=1, size=3.0), chain.joint_names[-1]
+    added = transmission(deformation, chain, name, values) - transmission(deformation, chain, name, values, lines=False)
+    c = deformation.momenta.theta[deformation.spec.nominal.parts["waves"]]  # pyright: ignore
+    expected = sum(c[2 * k] * (w * values).cos() + c[2 * k + 1] * (w * values).sin() for k, w in enumerate((7.3, 14.7)))
+    assert_close(added, expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", ["arm", "slides", "mimic slides"])

@@ -120,6 +120,11 @@ def test_recordings_with_clocks_of_their_own(offset: float, rate: float, tmp_pat
     assert abs(float(words[1]) - offset) < 0.03
 
 
+def test_the_noise_of_a_recording_is_that_of_its_values() -> None:
+    values = 3.0 + 0.2 * np.random.default_rng(0).normal(size=(20_000, 2))
+    assert Recording(np.arange(20_000.0), values).noise == pytest.approx(0.2, rel=0.03)
+
+
 def test_stops_and_the_offset_are_found() -> None:
     found, offset = stops(*recordings())
     assert offset == pytest.approx(OFFSET_S, abs=0.03)

@@ -204,8 +204,10 @@ def check_identification(data: Measurements, identification: Identification) -> 
         what, got = "measured orientations", f"a median of {math.degrees(float(angles.median())):.3g} degrees"
         expected = f"errors well below {math.degrees(gates.ORIENTATION_RAD):.0f} degrees"
     what = f"the {what} do not fit this robot, even with geometric errors"
+    reached = float(geometry.chain.tip_poses(data.q)[..., :3, 3].norm(dim=-1).max())
+    least = max(gates.UNEXPLAINED_RESIDUAL * size, gates.LARGE_PER_REACH * reached)  # points may hardly move
     advice = "check the angle unit, the order of the joints, the tip link or DH convention, and that rows pair joints "
-    advice = f"{advice}with their own points" * (turned or typical >= gates.UNEXPLAINED_RESIDUAL * size)
+    advice = f"{advice}with their own points" * (turned or typical >= least)
     said = {"what": what, "expected": expected, "got": got}
     likely_mistakes.check_fit(geometry.chain, data, typical, said, advice)
 

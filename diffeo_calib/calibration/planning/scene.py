@@ -194,9 +194,9 @@ def of_robot(
         data = replace(around(q), held=held, adrift=free)
         return View(data.points, data.linearisation(chosen), data.noise(chosen))
 
-    known = BeforeData(view(near[:1]).at.spec.prior_variance.sqrt())
+    before = BeforeData(view(near[:1]).at.spec.prior_variance.sqrt())
     averaged = Bodies(lever).averaging(points.new_zeros(points.numel(), points.numel()))
-    return Scene(known, len(known.deviations), view, geometry.base, averaged, points.numel(), free)
+    return Scene(before, len(before.deviations), view, geometry.base, averaged, points.numel(), free)
 
 
 def _measured_points(robot: Tree, marker: object, usual: object) -> tuple[Tensor, tuple[str, ...], float | None]:
