@@ -231,10 +231,10 @@ class Campaign:
         return replace(proposal, q=q, rows=proposal.rows[: count - len(again)], again=again)
 
     def wait(self) -> None:
-        """Wait for a model that is made in the background."""
-        if self._maker is not None:
+        """Wait for models that are made in the background: with one that is there the next may be due."""
+        while self._maker is not None:
             self._maker.join()
-        self.poll()
+            self.poll()
 
     def _add(self, whole: Any, waiting: int) -> None:
         """Judge some rows of a table, and renew the model if it is due."""

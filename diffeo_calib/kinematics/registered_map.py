@@ -9,20 +9,15 @@ errors e of the model at these rows and from their noise, u = u' - A (e + noise)
 with S the derivatives by u, U the covariance of u, and C the posterior covariance of the fit. The last terms matter: a
 base that the fit left uncertain is found anew together with the frame.
 
-A fitted map seen from another place: T o k1 for a rigid transform T, as exact as k1 itself.
-
-If the task kernel is the same in all directions, K_W(R y, R y') = K_W(y, y'), rotating points and momenta of a geodesic
-rotates the geodesic. So T o psi o k0 is the map with
+T o k1 is as exact as k1. If the task kernel is the same in all directions, K_W(R y, R y') = K_W(y, y'), rotating points
+and momenta of a geodesic rotates the geodesic. So T o psi o k0 is the map with
 
     base <- T base,    p <- R p,    noise <- R noise R^T,
 
-R the rotation of T. The controls z0 = k0(xi) follow the base, and theta stays: its error twist of the base stands
-behind the base.
+R the rotation of T. The controls z0 = k0(xi) follow the base, and theta stays: its error twist stands behind the base.
 
-Directions of base and markers that measurements hardly determine, in sentences.
-
-The place of the measuring frame is judged with the markers given: where both move together, the marker is what is not
-known, and turning the tool determines it.
+Sentences name what rows hardly determine: the measuring frame is judged with the markers given, since where both move
+together, the marker is what is not known, and turning the tool determines it.
 """
 
 from __future__ import annotations

@@ -106,9 +106,9 @@ def test_opencv_reads_the_files(tmp_path: Path) -> None:
     read = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
     assert_close(torch.from_numpy(read.getNode("distortion_coefficients").mat())[0], lens[4:])
     read = cv2.FileStorage(str(tmp_path / "hand_eye.yaml"), cv2.FILE_STORAGE_READ)
-    pose = HandEye.of(on_tool()).camera.pose
-    assert_close(torch.from_numpy(read.getNode("camera_R").mat()), pose[:3, :3])
-    assert_close(torch.from_numpy(read.getNode("camera_t").mat())[:, 0], pose[:3, 3])
+    own = HandEye.of(on_tool()).camera
+    for name, values in {"R": own.pose[:3, :3], "t": own.pose[:3, 3:], "covariance": own.covariance}.items():
+        assert_close(torch.from_numpy(read.getNode(f"camera_{name}").mat()), values)
     assert read.getNode("camera_parent").string() == "flange"
 
 

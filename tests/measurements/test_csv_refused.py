@@ -215,6 +215,7 @@ NOTHING = {"position": None, "sockets": None}
         (("7,8,,C", ",,s0,"), {}, "columns u, v: empty in all lines: expected some line that holds an image"),
         (("0.5,0.6,", "0.2,0.3,,,,1.5,,,,A,0.1\n0.7,0.6,"), {}, "line 6 repeats 3"),
         ((), {"sockets": None, "position": None, "readings": ()}, "`position` is missing"),
+        ((), {**NOTHING, "readings": (WIRE,)}, "line 2, column 'd' ... a finite number, got an empty cell"),
         ((), {"readings": (PLANE,)}, "one height for all rows beside rows of other kinds"),
         ((), {"position": None, "session": "who"}, "`session` beside `socket`"),
         ((), {**NOTHING, "session": "who"}, "`session` beside `readings`"),

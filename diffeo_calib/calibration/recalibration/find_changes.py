@@ -39,7 +39,6 @@ from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
-from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01  # probability that anything is named although nothing has changed
 
@@ -71,16 +70,12 @@ class Change:
     where: str = ""
 
     def __str__(self) -> str:
-        return f"{self.where}: {self._what}" if self.where else self._what
-
-    @property
-    def _what(self) -> str:
-        size = f"{1e3 * self.size:.2g}"
+        size, where = f"{1e3 * self.size:.2g}", f"{self.where}: " * bool(self.where)
         if self.deviation is not None:
             size = with_deviation(1e3 * self.size, 1e3 * self.deviation)
         size = f"{size} mrad ({degrees(self.size):.2g} degrees)" if self.angle else f"{size} mm"
         by = f", which moves the markers by {1e3 * self.displacement:.2g} mm" if self.angle else ""
-        part = " or ".join((self.part, *self.others)) + " (these rows do not tell which)" * bool(self.others)
+        part = where + " or ".join((self.part, *self.others)) + " (these rows do not tell which)" * bool(self.others)
         return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
@@ -126,16 +121,12 @@ class Changes:
         """Whether the robot was tested: else a change of it may be in new places of device and markers."""
         return bool(self.probabilities)
 
-    @property
-    def few(self) -> str:
-        """How many rows could be tested, in words."""
-        return f"only {self.rows} rows lie within the joint ranges that the model knows"
-
     def __str__(self) -> str:
         if self.level is None:
             return "changes of the robot were not tested"
         if not self.tested:
-            return f"{self.few}: changes were not tested, and what has changed is not known"
+            few = f"only {self.rows} rows lie within the joint ranges that the model knows"
+            return f"{few}: changes of the robot were not tested, and new places may hide one"
         if not self.found:
             places = "the places of device and markers, which may hide an offset of the first or the last joint"
             rows = f", {self.rows} rows" * bool(self.rows)
@@ -226,8 +217,7 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
     """
     changes, drifts = _changes_of(rows, level=level, seed=seed)
     if not changes.tested:
-        what = f"{changes.few}: changes of the robot were not tested, and the places that were found may hide one"
-        warn_user(sentence(what, fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
+        warn_user(sentence(str(changes), fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
     groups = groups_of(rows)
     if changes.found or not groups:
         return changes, drifts
@@ -248,9 +238,9 @@ def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
     Sessions, if there are several, and else the block of rows that hardly count.
     """
     data, flags = rows.set_up.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
-    named = [group for session in rows.set_up.sessions for group in session.groups()]
-    if named:
-        return {name: (index, float(flags[index].double().mean()) > MOST_OUTLIERS) for name, index in named}
+    for sessions in rows.set_up.sessions:  # one set, if there are several
+        groups = {f"session '{name}'": sessions.rows[sessions.device == k] for k, name in enumerate(sessions.names)}
+        return {name: (index, float(flags[index].double().mean()) > MOST_OUTLIERS) for name, index in groups.items()}
     distinct = len(data.line_numbers.unique()) == len(data)
     numbers = data.line_numbers.to(HOST) if distinct else torch.arange(len(data), device=HOST)
     order = numbers.argsort()
@@ -327,18 +317,18 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
 RANK_TOLERANCE = 1e-9  # smallest eigenvalue of correlations, relative to the largest, that is not rounding
 
 
-def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Offset, ...]:
+def hidden_offsets(set_up: NewSetUp, changes: Changes) -> tuple[Offset, ...]:
     """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
 
     Args:
-        robot: with n joints. set_up: where device and markers are. changes: as the rows show them.
+        set_up: where device and markers are. changes: as the rows show them.
     """
     rows, record = set_up.registered, set_up.registration
     if rows is None or record is None or changes.found:
         return ()
     S, J = rows.by_places.flatten(0, 1), rows.at.joint_to_start.flatten(0, 1)  # (M m, 6 + 3 P), (M m, n)
     covariance, noise = rows.inflation * rows.given.covariance, float(record.noise.diagonal().mean().sqrt())
-    T, centre = rows.transform, rows.centre
+    T, centre, chain = rows.transform, rows.centre, rows.marks.fitted.geometry.chain
     turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
     moved = torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])  # m and rad, of the frame in that of the map
     places = {"the measuring device has moved": (slice(0, 6), moved)}
@@ -352,7 +342,7 @@ def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Off
         count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):
             continue
-        for joint, name in enumerate(robot.joint_names):
+        for joint, name in enumerate(chain.joint_names):
             d = torch.linalg.lstsq(S[:, part], J[:, joint, None]).solution
             evidence = Evidence((white @ d).T @ away, (white @ d).T @ white @ d)
             if float(evidence.H) <= 0.0:  # It moves the places only as they are known not to move.
@@ -361,5 +351,5 @@ def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Off
             unseen = abs(size) * float((J[:, joint, None] - S[:, part] @ d).square().mean().sqrt())
             left = total - float(evidence.gain)
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
-                hidden.append(Offset(name, robot.kinds[joint] != "prismatic", size, deviation, instead))
+                hidden.append(Offset(name, chain.kinds[joint] != "prismatic", size, deviation, instead))
     return tuple(hidden)

@@ -130,14 +130,15 @@ def find_place(
     _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
     if opens and (beside := opened(best, some.rows(kept))) is not best:
         best = beside.settled()
-    said = {
-        "lever": search.data.lever,
-        "free": free,
-        "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
-        "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if search.known else None,
-        "same_place": odds.get("same", 0.0) if len(priors) > 1 else None,
-    }
-    return best, _record(best, said, known=search.known)
+    return best, _record(
+        best,
+        lever=search.data.lever,
+        free=free,
+        outliers=tuple(some.line_numbers[sorted(outliers)].tolist()),
+        shift=-best.away[6:].view(-1, 3) if search.known else None,
+        rms_before=_rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if search.known else None,
+        same_place=odds.get("same", 0.0) if len(priors) > 1 else None,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +146,11 @@ class Search:
     """What may be open in rows of a new set-up, and where a search for it may begin."""
 
     model: FittedMap  # the map, placed anew before or not, under the payloads of the rows
+    fit: FittedMap  # the map of the fit
     data: Measurements  # M rows that show P points
     old: Tensor  # (P, 3) where the model has them, or at the tip, m
     known: bool  # whether they may be there
+    same: bool  # whether the markers are those of the fit
     free: Tensor  # (6 + 3 P,) boolean, which unknowns of frame and points may have moved
 
     @classmethod
@@ -167,18 +170,8 @@ class Search:
         numbers = torch.arange(6 + old.numel(), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
         _check_enough(data, framed=free != "marker", known=alike)
-        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, alike, may)
-
-    @property
-    def fit(self) -> FittedMap:
-        """The map of the fit."""
-        return self.model.unregistered
-
-    @property
-    def same(self) -> bool:
-        """Whether the markers are those of the fit."""
-        before = self.model.registration
-        return self.known and (before is None or before.same)
+        model = model.with_nominal(robot_map(fit).under(data.payload))
+        return cls(model, model.unregistered, data, old, alike, alike and (before is None or before.same), may)
 
     def deviations(self, metres: float) -> Tensor:
         """(6 + 3 P,) of frame and points before the rows, for a deviation of the markers from their old places, m."""
@@ -334,8 +327,8 @@ def opened(rows: NewRows, data: Any) -> NewRows:
     return rows.changed(shared=shared, tails=tails, changed_among=best.text)
 
 
-def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
-    """Everything in the new measuring frame; ``known``: whether the markers may be where they were."""
+def _record(best: NewRows, *, lever: float | None, **said: Any) -> Registration:
+    """Everything in the new measuring frame; ``said``: what else the record holds."""
     given, markers, free, T = best.given, best.marks.points, best.free, best.transform
     R, k = T[:3, :3], len(best.free)
     whole, gain = best.known.clone(), given.gain.new_zeros(len(best.known), given.gain.shape[1])
@@ -346,24 +339,24 @@ def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registrat
     covariance = 0.5 * (covariance + covariance.mT)
     usual = float((best.inflation * given.V.diagonal()[given.visible.flatten()].median()).sqrt())
     arm = float((given.shown(best.y).unflatten(1, (-1, 3)) - best.centre).square().sum(-1).nanmean().sqrt())
-    geometry, count, rigid = best.marks.fitted.geometry, len(markers), said["lever"] is not None
+    geometry, count = best.marks.fitted.geometry, len(markers)
     tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
-    values = {
-        "transform": T,
-        "markers": markers,
-        "same": best.marks.same,
-        "shift": -best.away[6:].view(-1, 3) if known else None,
-        "covariance": covariance,
-        "centre": R @ best.centre + T[:3, 3],
-        "q": best.q,
-        "gain": ((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        "noise": turned(best.inflation * best.mean_noise, R),
-        "rms_after": _rms(given.shown(given.residual).unflatten(1, (-1, 3))),
-        "left_out_rms": _rms(given.left_out.unflatten(1, (-1, 3))),
-        "excess": float(scale_of(best)[0]) ** 0.5,
-        "undetermined": undetermined(covariance, markers, arm, usual, tips, rigid=rigid),
-    }
-    return Registration(**values | said)  # pyright: ignore[reportArgumentType]
+    return Registration(
+        transform=T,
+        markers=markers,
+        lever=lever,
+        same=best.marks.same,
+        covariance=covariance,
+        centre=R @ best.centre + T[:3, 3],
+        q=best.q,
+        gain=((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
+        noise=turned(best.inflation * best.mean_noise, R),
+        rms_after=_rms(given.shown(given.residual).unflatten(1, (-1, 3))),
+        left_out_rms=_rms(given.left_out.unflatten(1, (-1, 3))),
+        excess=float(scale_of(best)[0]) ** 0.5,
+        undetermined=undetermined(covariance, markers, arm, usual, tips, rigid=lever is not None),
+        **said,
+    )
 
 
 def _rms(errors: Tensor) -> float:
@@ -392,8 +385,7 @@ def warn_about(
         what = f"{len(record.outliers)} row(s) contradict all others and took no part: row {few(record.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
     if record.exchanged:
-        what = f"markers {few(record.exchanged)}, or axes of a measured frame, seem to be exchanged: each is where "
-        what += "another one was"
+        what = f"markers {few(record.exchanged)}, or axes of a measured frame, seem to be exchanged"
         warn_user(sentence(what, fix="put their columns in the order of the fit, unless they were mounted so"))
     for text in record.undetermined:
         warn_user(f"{text}.")

@@ -72,11 +72,6 @@ class NewSetUp:
     new_ball: bool = False  # whether the old model does not know it
 
     @property
-    def nominal(self) -> GeometryMap:
-        """Nominal map of the old model."""
-        return robot_map(self.fitted)
-
-    @property
     def transform(self) -> Tensor:
         """(4, 4) from the frame of the map to that of the new rows, m."""
         record = self.registration
@@ -85,7 +80,7 @@ class NewSetUp:
     @property
     def seen_before(self) -> Tensor:
         """(P,) boolean: the markers that new rows show and that old rows showed."""
-        shown = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)
+        shown = torch.zeros(robot_map(self.fitted).geometry.markers, dtype=torch.bool, device=HOST)
         if self.coordinates is not None:
             shown |= ~self.coordinates.table.points.isnan().any(2).all(0)
         shown[-1] |= self.ball is not None
@@ -109,7 +104,7 @@ class NewSetUp:
             deviations, marker: see :class:`NewRows`. same: whether these are the markers of the map.
         """
         (T, markers), q = places, self.data.q
-        marks = FlangePoints(self.nominal.under(self.data.payload), markers, same=same)
+        marks = FlangePoints(robot_map(self.fitted).under(self.data.payload), markers, same=same)
         points, at = self.fitted.geodesic.with_nominal(marks).linearised_value(q)
         points, nothing = points.detach(), torch.diag(0.0 * deviations)
         y, observe, sensor, noise, placement = self._measured(T, points, usual)
@@ -142,7 +137,12 @@ class NewSetUp:
         """Numbers, what these are of the points (M, 3 P), m, how they were measured, their noise, and the devices."""
         numbers, noise, sets = None, predicted[:0, :, None], list[DeviceSet]()
         if self.coordinates is not None:
-            numbers, noise, sets = self._coordinates(self.coordinates, T, predicted, usual)
+            new, index = self.coordinates
+            table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
+            y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
+            numbers = Told(index, torch.where(y.isnan(), predicted[index], y), sensor)
+            noise = without_hidden(noise_of_rows(self.fitted, new, table, T, usual), sensor.visible)
+            sets += CameraErrors.around(table, index)
         sets += self.sessions
         points = predicted.unflatten(1, (-1, 3))
         devices = [fitting_devices(table, points[part]) for table, part in self.readings]
@@ -160,17 +160,6 @@ class NewSetUp:
             total = larger(total, sensor.known)
         sensor = sensor.without_known
         return y, observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
-
-    def _coordinates(
-        self, coordinates: Coordinates, T: Tensor, predicted: Tensor, usual: UsualNoise
-    ) -> tuple[Told, Tensor, list[DeviceSet]]:
-        """Rows that tell coordinates, in the model's frame; their noise, and errors of cameras."""
-        new, rows = coordinates
-        table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
-        noise = noise_of_rows(self.fitted, new, table, T, usual)
-        y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
-        y, noise = torch.where(y.isnan(), predicted[rows], y), without_hidden(noise, sensor.visible)
-        return Told(rows, y, sensor), noise, [*CameraErrors.around(table, rows)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +199,7 @@ class NewRows:
     @property
     def nominal(self) -> GeometryMap:
         """Nominal map of the old model."""
-        return self.set_up.nominal
+        return robot_map(self.fitted)
 
     @property
     def visible(self) -> Tensor:

@@ -251,7 +251,7 @@ def _result(
         inflation=rows.inflation,
         fit=fitted,
         shift=None if record is None else away * place.seen_before[:, None],
-        hidden=hidden_offsets(model.robot, place, changes),
+        hidden=hidden_offsets(place, changes),
     )
 
 
@@ -363,7 +363,7 @@ def compare(
         errors=rows.by_kind(rows.placed_residual),
         expectations=rows.by_kind(rows.given.shown(expected)),
         usual=rows.by_kind(usual),
-        hidden=hidden_offsets(model.robot, rows.set_up, changes) if measured else (),
+        hidden=hidden_offsets(rows.set_up, changes) if measured else (),
         payload=payload,
     )
 
