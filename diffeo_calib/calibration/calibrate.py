@@ -66,8 +66,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, VALUE
 
 Controls = int | Literal["auto", "all"]
-Table = Measurements | Readings | Observations
-"""Measured rows of any kind."""
+Table = Measurements | Readings | Observations  # measured rows of any kind
 
 
 def check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
@@ -95,8 +94,7 @@ def check_controls(controls: Controls, measurements: Table) -> None:
 
 
 LOG = logging.getLogger(__name__)
-AUTO_CONTROLS = 200
-"""Configurations that carry momenta where all of them would need too large a matrix."""
+AUTO_CONTROLS = 200  # configurations that carry momenta where all of them would need too large a matrix
 ADVICE = "judge it by held-out errors, and if they are poor, measure more poses or pass fewer `controls`"
 """On a fit that did not converge: solver and time steps, on which the solver advises, are no arguments here."""
 

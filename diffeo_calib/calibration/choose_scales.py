@@ -53,18 +53,14 @@ from diffeo_calib.process.scales import DEVIATIONS, FOUND, PAYLOAD_FACTORS, SCAL
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
-FEWEST_POSES = 12
-"""Different poses below which the data cannot determine the scales: defaults are used."""
+FEWEST_POSES = 12  # different poses below which the data cannot determine the scales: defaults are used
 NOISE_SHARE = 0.3
 """Of the registration's residual, which counts as noise where the geometry has more parameters than there are data."""
 DOUBTED_WEIGHT = 0.25
 """Of a row beside the geometric calibration, below which the first search for scales leaves it out."""
-FEWEST_JUDGED = 30
-"""Rows below which leave-one-out errors are too few to judge the scales."""
-VARIANCE_RATIO = 2.5
-"""Factor between leave-one-out and predicted variances from which the scales are warned about."""
-MOST_COORDINATES = 8000
-"""Measured coordinates of the random rows that stand for all rows where there are more."""
+FEWEST_JUDGED = 30  # rows below which leave-one-out errors are too few to judge the scales
+VARIANCE_RATIO = 2.5  # factor between leave-one-out and predicted variances from which the scales are warned about
+MOST_COORDINATES = 8000  # measured coordinates of the random rows that stand for all rows where there are more
 
 
 @dataclass(frozen=True)
@@ -196,8 +192,7 @@ def _inflated(
     return ChosenScales(selection, data, leave_one_out(data, scales, seed), row_scales, unresolved)
 
 
-FEWEST_REPEATS = 10
-"""Rows that repeat poses from which the noise is known by them."""
+FEWEST_REPEATS = 10  # rows that repeat poses from which the noise is known by them
 SUPPORT = 2.0
 """Log marginal likelihood by which noise of each command must be better than noise of the device alone: the two numbers
 that it has more along three axes (H. Akaike, "A new look at the statistical model identification", 1974)."""
@@ -283,8 +278,7 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
         warn_user(sentence("leave-one-out errors contradict the selected scales", expected=expected, got=got, fix=fix))
 
 
-POSES, COORDINATES = 300, 1500
-"""Most poses and coordinates on which the factor is chosen."""
+POSES, COORDINATES = 300, 1500  # most poses and coordinates on which the factor is chosen
 
 
 def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Hyperparameters:
@@ -297,8 +291,7 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     return max(tried, key=lambda candidate: some.process(candidate).evidence)
 
 
-RESIDUAL_TOLERANCE = 1e-5
-"""Of coupling and end residual: the remaining error is far below the noise."""
+RESIDUAL_TOLERANCE = 1e-5  # of coupling and end residual: the remaining error is far below the noise
 
 
 def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
@@ -321,8 +314,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
     return problem(basis.value(data.y), noise, data.nominal.changed(rigid=True), basis).standing_for(whole)
 
 
-MOST_REACH = 1.5
-"""Of robots of the same type, relative to each other: tools differ."""
+MOST_REACH = 1.5  # of robots of the same type, relative to each other: tools differ
 
 
 def check_models(models: object, robot: Tree) -> None:

@@ -48,10 +48,8 @@ def stands_free(model: CalibratedKinematics) -> bool:
 OPEN_RATIO = 10.0
 """A direction of base and markers is open if it moves points anywhere by this factor more than in the rows, or than
 their noise."""
-MARKER_SHARE = 0.3
-"""Shift of a marker relative to that of the base from which the marker is named."""
-MOST_ROWS = 300
-"""Rows of a fit that show what their configurations determine and what is expected there."""
+MARKER_SHARE = 0.3  # shift of a marker relative to that of the base from which the marker is named
+MOST_ROWS = 300  # rows of a fit that show what their configurations determine and what is expected there
 
 
 @dataclass(frozen=True)
@@ -244,17 +242,12 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     return root, anywhere, without_shared(rows, shared)
 
 
-STILL_RANGE = 0.05
-"""Range of a joint, rad or m, below which the rows do not show its errors."""
-SAG_DEVIATION = 5e-4
-"""Prior scale of the sag of any robot's joints, rad or m: 100 N m on a gear of 2e5 N m/rad."""
-SHOWN_SHARE = 0.5
-"""Share of the variance of its features in any poses, from which the rows show the sag of a joint."""
-SMALLEST_SPREAD = 0.1
-"""Spread of features, relative to the largest, below which a combination of them does not count."""
+STILL_RANGE = 0.05  # range of a joint, rad or m, below which the rows do not show its errors
+SAG_DEVIATION = 5e-4  # prior scale of the sag of any robot's joints, rad or m: 100 N m on a gear of 2e5 N m/rad
+SHOWN_SHARE = 0.5  # share of the variance of its features in any poses, from which the rows show the sag of a joint
+SMALLEST_SPREAD = 0.1  # spread of features, relative to the largest, below which a combination of them does not count
 SMALLEST_EFFECT = 1e-12
-BASE_PER_DEVIATION = 3.0
-"""The base moves along with an undetermined marker and must not hold it."""
+BASE_PER_DEVIATION = 3.0  # the base moves along with an undetermined marker and must not hold it
 
 
 def with_open_directions(fitted: FittedMap, q: Tensor, registration: Identification, *, rigid: bool) -> FittedMap:

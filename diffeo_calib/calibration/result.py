@@ -183,8 +183,7 @@ class CalibrationResult:
         return f"{self.fit.status}; scales: {self.selection.status}"
 
 
-MOST_CONFIGURATIONS = 8000
-"""Configurations on which the parts of a model are measured."""
+MOST_CONFIGURATIONS = 8000  # configurations on which the parts of a model are measured
 
 
 def parts(model: CalibratedKinematics) -> list[Part]:

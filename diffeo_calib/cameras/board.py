@@ -50,8 +50,7 @@ def board_slopes(points: Tensor, size: float) -> Tensor:
     return torch.stack([real_board(points, unit, size) - points for unit in units], -1)
 
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""Parameters of a lens: pixels for the first four."""
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # parameters of a lens: pixels for the first four
 
 
 def project(points: Tensor, lens: Tensor) -> Tensor:

@@ -19,16 +19,14 @@ import numpy as np
 
 from diffeo_calib.common.errors import InputError, few
 
-MOST_SQUARES = 10_000
-"""Of a board."""
+MOST_SQUARES = 10_000  # of a board
 FORMS = {"charuco": (5,), "chessboard": (3,), "aruco": (5, 6, 7), "tag": (4,)}
 """Kinds of boards, and words of their texts."""
 FEWEST_CORNERS = 8
 BLURRED_PX, MOVED_RATIO = 5.0, 1.6
 """Median width of edges at corners, pixels, from which an image is blurred, and how much wider than edges in another
 direction, from which something moved. A lens that blurs by a standard deviation of 0.7 px makes widths of 2."""
-HALF_PATCH_PX = 8
-"""Half of the side of the patch around a corner in which edges are measured, pixels."""
+HALF_PATCH_PX = 8  # half of the side of the patch around a corner in which edges are measured, pixels
 ACROSS, DOWN = ("right", "left"), ("down", "up")
 ORDERS = [f"{one}-{other}" for first, then in ((ACROSS, DOWN), (DOWN, ACROSS)) for one in first for other in then]
 """Where the numbers of a grid of markers run, first within a line."""
@@ -39,17 +37,14 @@ BENDS = (0.0, 0.1, 0.2, -0.1, -0.2, -0.3, -0.4, -0.5, -0.6)
 SNAPPED_PX, SNAPPED_SHARE = 0.5, 0.13
 """Median distance from a plane from which corners of markers are sought again, within this share of a marker's side:
 those that touch squares, as in grids of Kalibr, are found too far inside."""
-WIDEST = 16
-"""Squares or markers across other boards that are tried."""
+WIDEST = 16  # squares or markers across other boards that are tried
 REFINED_PX = 5
 """Half of the side of the window in which corners of a ChArUco board are refined: detectors leave twice the error."""
-Found = tuple[np.ndarray, np.ndarray]
-"""Numbers (K,) of corners, and their pixels (K, 2)."""
+Found = tuple[np.ndarray, np.ndarray]  # numbers (K,) of corners, and their pixels (K, 2)
 NONE: Found = np.zeros(0, int), np.zeros((0, 2))
 Made = tuple[np.ndarray, Callable[[np.ndarray], Found], Callable[[np.ndarray], Found], dict[int, np.ndarray]]
 """Points, find, markers and layout of a board."""
-BENT = "corners that no plane explains"
-"""The reason of an image whose corners contradict the board."""
+BENT = "corners that no plane explains"  # the reason of an image whose corners contradict the board
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Of lenses as files hold them; those after k3 must be zero."""
 MODELS = {"plumbbob", "radtan", "radialtangential", "brown", "brownconrady", "rationalpolynomial", "opencv", "pinhole"}
 """Names of the distortion that is read, without what joins their words."""
-NOT = {"0", "false", "no", "none", "off"}
-"""Values of names of lenses that are none of them."""
+NOT = {"0", "false", "no", "none", "off"}  # values of names of lenses that are none of them
 READ = "a pinhole with plumb_bob or radtan, 0 after k1, k2, p1, p2, k3"
 MODEL_NAMES = re.compile("model|type|lens|distortion|projection|fisheye|^xi$")
 BENT = re.compile(
@@ -43,12 +42,10 @@ BENT = re.compile(
 )
 BENT_WHOLE = {"mei", "ds", "ucm", "fov", "xi", "kb", "kb4"}
 """Words of lenses that are not read even without distortion, anywhere or as a whole name or value."""
-OTHER = re.compile("inverse|modified|division|prism")
-"""Words of another distortion."""
+OTHER = re.compile("inverse|modified|division|prism")  # words of another distortion
 WORD = re.compile(r"""(?<![\w.])["']?([A-Za-z_][\w.]*)(?:["'][ \t]*:|[ \t]*:(?=[\s\[{"']|$))""")
 LARGEST_FILE = 1_000_000
-LARGEST = 1e6
-"""Above all numbers of cameras: focal lengths are some thousand pixels."""
+LARGEST = 1e6  # above all numbers of cameras: focal lengths are some thousand pixels
 BOARD, ROOT = "board", "root"
 """Matrices that only files of this package hold: (5,) of the board, and (14, c) of the uncertainty."""
 

@@ -39,25 +39,19 @@ from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transform
 
 UNKNOWNS = (*LENS, *BOARD)
 FEWEST_CORNERS = 6
-OUTLIER_DEVIATIONS = 3.5
-"""Errors of corners, in standard deviations of their image, from which they lose their weight."""
+OUTLIER_DEVIATIONS = 3.5  # errors of corners, in standard deviations of their image, from which they lose their weight
 ROUNDS, STEPS = 6, 30
 CONVERGED, DAMPED = 1e-10, 1e10
 SMALLEST_NOISE_PX = 1e-3
-PRIOR_IMAGE_CORNERS = 10.0
-"""Corners of a usual image whose noise counts beside an image's own."""
+PRIOR_IMAGE_CORNERS = 10.0  # corners of a usual image whose noise counts beside an image's own
 CENTRE_SHARE, FOCAL_SHARE = 0.25, 1.0
 """Prior deviations of the principal point relative to the image's width, and of focal lengths."""
 CHANGED_PROBABILITY = 1e-3
 """Of a difference as large between lenses and boards of two dates that are the same, below which they are others."""
-BOARD_DIGITS = 7
-"""Decimal places, m, of corners of a board that are the same."""
-EDGE_SHARE = 1.02
-"""Largest angle from the axis at which corners are seen, relative to that of the image's own corners."""
-MOST_TOGETHER = 512
-"""Images whose slopes are held at a time."""
-DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)
-"""Prior standard deviations of k1, k2, p1, p2, k3."""
+BOARD_DIGITS = 7  # decimal places, m, of corners of a board that are the same
+EDGE_SHARE = 1.02  # largest angle from the axis at which corners are seen, relative to that of the image's own corners
+MOST_TOGETHER = 512  # images whose slopes are held at a time
+DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)  # prior standard deviations of k1, k2, p1, p2, k3
 
 
 @dataclass(frozen=True, eq=False)

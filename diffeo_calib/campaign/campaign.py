@@ -29,8 +29,7 @@ from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
-FIRST_ROWS = 12
-"""Accepted rows of the first model."""
+FIRST_ROWS = 12  # accepted rows of the first model
 ROWS_GROWTH_PER_MODEL, WAITING_GROWTH, TOGETHER = 1.5, 2.5, 24
 """Factor by which the accepted rows grow between two models, and between those while more rows wait; most rows that are
 judged together."""
@@ -40,8 +39,7 @@ NEAR, NEAR_GROWTH = 1.5, 1.15
 """Expected error, relative to the goal, from which on scales are selected more often, and the factor there."""
 CANDIDATES, TARGETS = 120, 40
 """Poses among which the next ones are chosen, and those at which the robot shall be accurate."""
-SAME_POSE = 5e-3
-"""Largest difference of a joint between a pose and its repeat, rad or m."""
+SAME_POSE = 5e-3  # largest difference of a joint between a pose and its repeat, rad or m
 MOST_STEPS, MOST_ROWS = 60, 10_000
 """Poses that a forecast chooses, beyond which the variance is extrapolated as a power of their number; most of them."""
 

@@ -38,16 +38,12 @@ from typing import IO, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, as_written
 
-DECISIONS = ("accept", "reject", "repeat")
-"""Decisions of a user on a row: methods of a campaign."""
-ID = "id"
-"""Column that tells rows apart."""
-LARGEST, LONGEST_WORD, LONGEST_LINE = 1e300, 200, 1 << 20
-"""Number and characters of a cell, and bytes of a line."""
+DECISIONS = ("accept", "reject", "repeat")  # decisions of a user on a row: methods of a campaign
+ID = "id"  # column that tells rows apart
+LARGEST, LONGEST_WORD, LONGEST_LINE = 1e300, 200, 1 << 20  # number and characters of a cell, and bytes of a line
 
 Entry = dict[str, Any]
-Inbox = Queue[Entry | DiffeoCalibError | None]
-"""Objects that were sent, or why a line is none; None at the end."""
+Inbox = Queue[Entry | DiffeoCalibError | None]  # objects that were sent, or why a line is none; None at the end
 
 
 def parsed(text: bytes) -> Entry:

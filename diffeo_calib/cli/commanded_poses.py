@@ -36,13 +36,11 @@ SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
 UNUSUAL_LENGTHS = ("", ""), ("cm", ""), ("inch", ""), ("", "cm"), ("", "inch")
 """Units of the machine's places and of those measured, tried until one explains the rows; empty: by their size."""
-MOST_ROWS, STEPS = 40, (1, 3)
-"""Rows whose motions are compared, and how many rows each of these spans."""
+MOST_ROWS, STEPS = 40, (1, 3)  # rows whose motions are compared, and how many rows each of these spans
 MOST_WAYS, FEW_WAYS = 60, 6
 """Ways to read the rows that are tried with a registration; if half of so many are right, no rotation is sure."""
 TURNED = "robot_pose", "angle", "convention", "rotation_angle", "camera_on_tool"
-GOOD_MOTIONS = 0.75
-"""Share of the motions that are compared: those that agree best."""
+GOOD_MOTIONS = 0.75  # share of the motions that are compared: those that agree best
 ALIKE, EXACT = 6.0, 1e-6
 """Ways that leave more than so many times what the best one leaves are wrong; and shares that are as good as none."""
 

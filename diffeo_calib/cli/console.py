@@ -26,8 +26,7 @@ from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
 from diffeo_calib.common.errors import PACKAGE, few, printable
 from diffeo_calib.common.files import remove_unfinished
 
-WIDTH = 160
-"""Width of tables that are not shown on a terminal, so that no number is cut off."""
+WIDTH = 160  # width of tables that are not shown on a terminal, so that no number is cut off
 WORDS = {
     "registration": "finding base and markers",
     "geometry": "geometric calibration",
@@ -130,11 +129,9 @@ def _as_options(text: str) -> str:
 
 
 INTERRUPTED = "interrupted before there was a result to keep"
-NOTHING_TO_KEEP = ("registration", "geometry")
-"""Tasks of a calibration whose interruption leaves no model."""
+NOTHING_TO_KEEP = ("registration", "geometry")  # tasks of a calibration whose interruption leaves no model
 
-Progress = Callable[[str, int, int], None]
-"""``progress(task, done, total)``."""
+Progress = Callable[[str, int, int], None]  # ``progress(task, done, total)``
 
 
 class Interrupts:

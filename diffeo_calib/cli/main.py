@@ -52,12 +52,9 @@ else:
 
 SUFFIX = ".toml"
 COMMAND, LIVE = "fit", "campaign"
-JOINED = ("rotation-std",)
-"""Entries that may be lists of columns although the option can be repeated."""
-LONGEST_FILE = 1 << 20
-"""Bytes: a file of options is short."""
-IN_FILE_OF = {"record": "images", "demo": "fit", "predict": "evaluate"}
-"""Command -> that whose file holds its work."""
+JOINED = ("rotation-std",)  # entries that may be lists of columns although the option can be repeated
+LONGEST_FILE = 1 << 20  # bytes: a file of options is short
+IN_FILE_OF = {"record": "images", "demo": "fit", "predict": "evaluate"}  # command -> that whose file holds its work
 GONE = {
     "compare": "write `recalibrate OLD OTHER` without -o",
     "report": "write `evaluate MODEL [CSV] --report PAGE`",
@@ -81,8 +78,7 @@ GONE = {
 """Former name of a command or an option, and what to do now."""
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
-_arguments: list[str] = []
-"""Of the command that runs."""
+_arguments: list[str] = []  # of the command that runs
 
 
 def command_line() -> str:

@@ -148,12 +148,10 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
         yield f"{what}: these rows meet the model as it was at {drift.holds()}"
 
 
-LONGEST_TOOL_PER_REACH = 5.0
-"""From where a tool is refused: its unit is wrong."""
+LONGEST_TOOL_PER_REACH = 5.0  # from where a tool is refused: its unit is wrong
 
 
-MEASURED = "measured:"
-"""Before the numbers of a tool in the measured frame."""
+MEASURED = "measured:"  # before the numbers of a tool in the measured frame
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, table: TableFormat) -> Tensor:

@@ -23,10 +23,8 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds
 
-WIDEST = 1000
-"""Characters of the widest table."""
-EXIT_ABOVE = 4
-"""The errors are larger than --tolerance."""
+WIDEST = 1000  # characters of the widest table
+EXIT_ABOVE = 4  # the errors are larger than --tolerance
 UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "m": ("m", 1.0), "px": ("px", 1.0)}
 """Unit of a limit -> unit in which it is compared, and how many are one of these; own kinds of readings have others."""
 

@@ -105,8 +105,7 @@ def remove_earlier(arguments: Sequence[str]) -> None:
                     path.unlink()
 
 
-ERRORS = "errors"
-"""As in sensors/errors.py, which loads torch."""
+ERRORS = "errors"  # as in sensors/errors.py, which loads torch
 
 
 def kind_entry(errors: Evaluation, *, metres: bool = False) -> dict[str, object]:

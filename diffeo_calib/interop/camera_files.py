@@ -12,8 +12,7 @@ from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 
-FRAME = "_optical_frame"
-"""A camera's frame, behind its name: x right, y down, z ahead (REP 103)."""
+FRAME = "_optical_frame"  # a camera's frame, behind its name: x right, y down, z ahead (REP 103)
 
 
 def camera_files(

@@ -40,12 +40,9 @@ from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
 
-PARALLEL_SINE = 0.05
-"""Sine of the angle between two axes below which they are treated as nearly parallel (3 degrees)."""
-COINCIDENT_AXES_M = 1e-14
-"""Distance, m, below which two parallel axes are one."""
-SHORT_PROJECTION = 0.01
-"""Length of a projected direction, per length, below which another one is projected."""
+PARALLEL_SINE = 0.05  # sine of the angle between two axes below which they are treated as nearly parallel (3 degrees)
+COINCIDENT_AXES_M = 1e-14  # distance, m, below which two parallel axes are one
+SHORT_PROJECTION = 0.01  # length of a projected direction, per length, below which another one is projected
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,8 +57,7 @@ from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.kinds import stored_devices
 
 UNITS = {"length": "m", "angle": "rad"}
-LARGEST_PARAMETER = 1e6
-"""Of a robot, m or rad: beyond it results have no correct digits."""
+LARGEST_PARAMETER = 1e6  # of a robot, m or rad: beyond it results have no correct digits
 ENTRIES = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
 OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
 """Entries of every header, and those that it may have or not."""
@@ -86,8 +85,7 @@ SESSIONS = (SHARED, "session", "session_tools")
 one calibration had several sessions, whose markers are those of the model."""
 PREFIX = "registration_"
 ARRAYS = ("transform", "markers", "covariance", "centre", "q", "gain", "noise")
-LEARNT = "learnt"
-"""Entry of a registration that the map learnt from, no map around another one."""
+LEARNT = "learnt"  # entry of a registration that the map learnt from, no map around another one
 PROBE_TOLERANCE = 1e-9
 """Largest relative difference between values of a profile passed to `load` and of that of the fit."""
 

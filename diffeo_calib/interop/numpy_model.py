@@ -28,10 +28,8 @@ from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded
 from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import LONGEST_TOOL, Program, check_frame
 
-FORMAT = 3
-"""Version of the file layout; files of other versions are refused."""
-ENTRY = "diffeo_calib"
-"""Key of the header in the file's metadata."""
+FORMAT = 3  # version of the file layout; files of other versions are refused
+ENTRY = "diffeo_calib"  # key of the header in the file's metadata
 
 UNSOUND = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """Raised by contents that do not fit together: a forged header can hold any value in any place."""

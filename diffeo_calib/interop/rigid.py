@@ -34,21 +34,17 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 
-RANGE_ROWS = 200
-"""Least number of configurations in the joint ranges of rows that show no positions."""
+RANGE_ROWS = 200  # least number of configurations in the joint ranges of rows that show no positions
 GEOMETRIC, PROJECTION, NOMINAL = "geometric calibration", "projection of the model", "nominal kinematics"
-FOLDS = 5
-"""Of the cross-validation."""
+FOLDS = 5  # of the cross-validation
 OFFSET_STD, LOOSE_STD = 2e-3, 0.5
 """Prior standard deviations of joint offsets, and of those that only tell the noise, rad or m.
 
 What offsets and base explain equally well goes to the base. Offsets that hardly matter stay small: of a wrist joint
 near its marker, say, which least squares alone puts off by degrees for micrometres.
 """
-PLACE_STD = 1e-2
-"""Prior standard deviation of base and markers around the model's own, m or rad."""
-FIXED_STD = 1e-9
-"""Prior standard deviation of joint errors that are to stay, m or rad."""
+PLACE_STD = 1e-2  # prior standard deviation of base and markers around the model's own, m or rad
+FIXED_STD = 1e-9  # prior standard deviation of joint errors that are to stay, m or rad
 TOLERATED_RMS_RATIO = 1.01
 """Relative increase of the RMS distance at which base and markers close to the model's are no good fit."""
 

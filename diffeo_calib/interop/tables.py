@@ -28,11 +28,9 @@ from diffeo_calib.robots.cartesian import SLIDES, is_cartesian
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 from diffeo_calib.robots.tree import Tree
 
-TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4
-"""Distance between the rows of a table, rad and m."""
+TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4  # distance between the rows of a table, rad and m
 MOST_ROWS = 100_000
-FIXED_POINT_STEPS = 20
-"""Of c = q - e(c): every step makes the error smaller by the slope of e, a thousandth or so."""
+FIXED_POINT_STEPS = 20  # of c = q - e(c): every step makes the error smaller by the slope of e, a thousandth or so
 
 
 def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:

@@ -39,10 +39,8 @@ from diffeo_calib.runtime.tables import TURN
 OUTPUTS = ("points", "tool_poses", "poses")
 PRECISIONS = {torch.float64: 1e-9, torch.float32: 1e-4}
 """Largest accepted difference between a program and its model, m, by the type of its numbers."""
-EXAMPLE_ROWS = 3
-"""Rows of the input with which programs are recorded; they run on any number."""
-DESCRIPTION = "diffeo_calib.json"
-"""Name of the description inside ``.pt2`` files."""
+EXAMPLE_ROWS = 3  # rows of the input with which programs are recorded; they run on any number
+DESCRIPTION = "diffeo_calib.json"  # name of the description inside ``.pt2`` files
 
 
 class Constants(nn.Module):

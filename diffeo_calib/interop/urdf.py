@@ -40,10 +40,8 @@ from diffeo_calib.robots.tree import BASE, Tree
 from diffeo_calib.robots.urdf import read_urdf
 from diffeo_calib.robots.urdf_elements import LARGEST_FILE, xml_of
 
-SAME_ROBOT_TOLERANCE = 1e-9
-"""Largest difference, m or rad, between two descriptions of one robot."""
-READ_BACK = 1e-12
-"""Largest difference, per metre of reach, between poses by the written file and by the geometry."""
+SAME_ROBOT_TOLERANCE = 1e-9  # largest difference, m or rad, between two descriptions of one robot
+READ_BACK = 1e-12  # largest difference, per metre of reach, between poses by the written file and by the geometry
 ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.regression.conditional import Process
 
-RELATIVE_RIDGE = 1e-9
-"""Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""
+RELATIVE_RIDGE = 1e-9  # relative size of the diagonal that keeps H invertible where rows do not determine all unknowns
 
 
 class Evidence(NamedTuple):

@@ -32,11 +32,9 @@ from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots.placement import PLACES
 
-TRANSMISSION_PROFILE = MaternProfile(2.5)
-"""Gears have several harmonics, for which a Gaussian kernel is too smooth."""
+TRANSMISSION_PROFILE = MaternProfile(2.5)  # gears have several harmonics, for which a Gaussian kernel is too smooth
 COUPLED_PROFILE = TASK_PROFILE = GaussianProfile()
-SENSOR_SHARE = 0.2
-"""Default noise of the sensor, relative to the residual of the geometric calibration."""
+SENSOR_SHARE = 0.2  # default noise of the sensor, relative to the residual of the geometric calibration
 NEGLIGIBLE_DISPLACEMENT = 3e-3
 """Prior displacement, relative to the standard deviation of the noise, that no amount of data would reveal."""
 FIELD_AMPLITUDES = ("transmission_amplitude", "coupled_amplitude", "joint_noise", "task_amplitude")

@@ -11,10 +11,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 
-NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
-"""How to repair a matrix that float64 cannot factorise."""
-MOST_ADDED = 128
-"""Rows of a factor that are kept apart from the first ones."""
+NOISE_ADVICE = "raise `noise` or lower the kernels' variances"  # how to repair a matrix that float64 cannot factorise
+MOST_ADDED = 128  # rows of a factor that are kept apart from the first ones
 
 
 def lower_root(F: Tensor) -> Tensor:

@@ -32,10 +32,8 @@ BLOCK = 1 << 16  # numbers of a likelihood that are added at once
 FACTORS = 0.01, 1e4  # between which the factor is sought
 
 
-FREEDOM, FREEDOM_EFOLDS = 40.0, 0.8
-"""Log-normal prior of nu: its centre, and the standard deviation of its logarithm."""
-ROWS = 60.0
-"""Number of independent errors whose quantile counts as much as the distribution."""
+FREEDOM, FREEDOM_EFOLDS = 40.0, 0.8  # log-normal prior of nu: its centre, and the standard deviation of its logarithm
+ROWS = 60.0  # number of independent errors whose quantile counts as much as the distribution
 SCALE_EFOLDS, OTHER_DATE = 0.8, 2.0
 """Standard deviation of log s around zero, of a calibration's own scales and on another date.
 

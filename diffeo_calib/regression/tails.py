@@ -33,8 +33,7 @@ SMALLEST_FREEDOM, GAUSSIAN_FREEDOM = 2.0, 100.0
 """Bound below which the variance would be infinite, and nu from which noise counts as Gaussian."""
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged: gross errors make all weights small at first."""
-FREEDOM_GRID_POINTS = 400
-"""Points of the logarithmic grid of nu: steps of one percent."""
+FREEDOM_GRID_POINTS = 400  # points of the logarithmic grid of nu: steps of one percent
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,7 @@ SHARES = (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4)
 VARIANCES = (16.0, 4.0, 2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Candidates of c, e, and the variance of good errors: noise chosen with gross ones among them is too large."""
 FREEDOMS = tuple(2.0 * 100.0 ** (i / 19) for i in range(20))
-EVIDENCE = 5.0
-"""Log likelihood by which good and gross must explain errors better than Student's t."""
+EVIDENCE = 5.0  # log likelihood by which good and gross must explain errors better than Student's t
 
 
 def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:

@@ -28,10 +28,8 @@ from diffeo_calib.common.errors import InputError, shown
 
 LOCAL = ("127.0.0.1", "localhost")
 PATHS = tuple(f"/{name}" for name in DECISIONS)
-SHOWN_ROWS, SHOWN_POSES = 8, 500
-"""The last rows, and poses."""
-LAST_SECONDS = 0.6
-"""Time for a page, which asks twice a second, to see the last state."""
+SHOWN_ROWS, SHOWN_POSES = 8, 500  # the last rows, and poses
+LAST_SECONDS = 0.6  # time for a page, which asks twice a second, to see the last state
 
 
 class Page(ThreadingHTTPServer):

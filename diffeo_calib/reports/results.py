@@ -46,8 +46,7 @@ def tree(kind: Any, depth: int) -> dict[str, Any]:
     return {str: {"anyOf": [schema(kind), schema(tree(kind, depth - 1))]} if depth > 1 else kind}  # pyright: ignore
 
 
-MAYBE = float | None
-"""Null where there is none, or where it is not finite."""
+MAYBE = float | None  # null where there is none, or where it is not finite
 TRANSFORM = schema([schema([float], minItems=4, maxItems=4)], minItems=4, maxItems=4)
 SIZES = ("rms", "median", "p95", "max")
 ANGLES = {"rows": int} | {f"angle_{size}_deg": MAYBE for size in SIZES}

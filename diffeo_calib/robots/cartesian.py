@@ -23,15 +23,12 @@ from diffeo_calib.robots.se3 import nearest_rotations, rigid_poses, transforms
 from diffeo_calib.robots.tree import Chain, Tree
 
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
-PLACES = SLIDES[:1], SLIDES[:2], SLIDES
-"""Names of the joints; and those of places."""
+PLACES = SLIDES[:1], SLIDES[:2], SLIDES  # names of the joints; and those of places
 BEYOND, LEAST_BEYOND, LEAST_BEYOND_RAD = 0.25, 0.01, 0.35
 """Limits lie beyond the poses by this share of their range; of slides at least by a share of the largest range, so that
 one that stood still can be corrected; of turns at least by so much."""
-FLAT, STEEPEST = 0.8, 0.97
-"""Sine of the largest b about the mean of the poses, and about any middle."""
-DIRECTIONS = 2000
-"""Of the z-axis of M that are tried."""
+FLAT, STEEPEST = 0.8, 0.97  # sine of the largest b about the mean of the poses, and about any middle
+DIRECTIONS = 2000  # of the z-axis of M that are tried
 
 
 def cartesian(poses: object) -> Chain:

@@ -19,10 +19,8 @@ from diffeo_calib.robots.tree import Chain, Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
-LARGEST_ANGLE_RAD = 4 * pi
-"""Larger ones are probably in degrees."""
-LONGEST_LINK_M = 20.0
-"""Longer ones are probably in millimetres."""
+LARGEST_ANGLE_RAD = 4 * pi  # larger ones are probably in degrees
+LONGEST_LINK_M = 20.0  # longer ones are probably in millimetres
 ENTRIES, MOST_ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])", 7
 
 

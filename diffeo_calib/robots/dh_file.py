@@ -57,10 +57,8 @@ INDEXED = re.compile(r"(a|alpha|d|theta)[_ ]*[{(]?\s*(?:[ijkn](\s*-\s*1)?|(prev)
 VALUE = re.compile(r"(?:^|\+)(?:q|theta|th|d)_?\{?\d*\}?\*?(?=$|[+-])")
 """The joint's own value in a cell, such as q1 or theta_1*."""
 TURNS = re.compile(r"([+-]?[\d.]*)\*?pi(?:/([\d.]+))?")
-RIGHT_ANGLE_RAD = 0.02
-"""Largest difference from 90 or 180 degrees that is one of calibration."""
-LARGEST_FILE = 1_000_000
-"""Bytes of a file that no table has."""
+RIGHT_ANGLE_RAD = 0.02  # largest difference from 90 or 180 degrees that is one of calibration
+LARGEST_FILE = 1_000_000  # bytes of a file that no table has
 
 
 @dataclass(frozen=True)

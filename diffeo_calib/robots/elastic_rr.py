@@ -16,18 +16,12 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, wrapped
 
-NOMINAL_LENGTHS = (1.0, 0.5)
-"""l1, l2 of (22) [length units]."""
-REAL_LENGTHS = (1.08, 0.46)
-"""L1, L2: unloaded lengths of the real links [length units]."""
-BASE_OFFSET = (0.04, -0.03)
-"""Position of the real arm's base [length units]."""
-LOADS = (1.0, 1.0)
-"""W1 at the elbow, W2 at the tip: weights along -y [force units]."""
-BENDING_STIFFNESS = (25.0, 6.0)
-"""E I1, E I2 [force x length^2]."""
-AXIAL_STIFFNESS = 200.0
-"""E A of both links [force]."""
+NOMINAL_LENGTHS = (1.0, 0.5)  # l1, l2 of (22) [length units]
+REAL_LENGTHS = (1.08, 0.46)  # L1, L2: unloaded lengths of the real links [length units]
+BASE_OFFSET = (0.04, -0.03)  # position of the real arm's base [length units]
+LOADS = (1.0, 1.0)  # W1 at the elbow, W2 at the tip: weights along -y [force units]
+BENDING_STIFFNESS = (25.0, 6.0)  # e I1, E I2 [force x length^2]
+AXIAL_STIFFNESS = 200.0  # e A of both links [force]
 
 
 def nominal(x: Tensor) -> Tensor:

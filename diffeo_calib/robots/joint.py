@@ -21,11 +21,9 @@ from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.runtime.build import ROTARY
 
 KINDS = (*ROTARY, "prismatic", "fixed")
-LARGEST_OFFSET = 1e6
-"""No joint is farther from the one before it [m], and none is geared by more."""
+LARGEST_OFFSET = 1e6  # no joint is farther from the one before it [m], and none is geared by more
 UNIT_ROUNDING = 1e-15  # of the length of a vector that was divided by it
-SQUARABLE = 1e-100
-"""Smaller numbers have squares that may be 0."""
+SQUARABLE = 1e-100  # smaller numbers have squares that may be 0
 
 
 @dataclass(frozen=True, eq=False)

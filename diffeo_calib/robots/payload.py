@@ -14,8 +14,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, RobotError,
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Ends, Tree
 
-ABSURD, BEYOND = 1000.0, 1.1
-"""Masses, relative to the largest of the fit, that are refused and that are warned about."""
+ABSURD, BEYOND = 1000.0, 1.1  # masses, relative to the largest of the fit, that are refused and that are warned about
 
 
 @dataclass(frozen=True, eq=False)

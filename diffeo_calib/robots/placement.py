@@ -52,14 +52,11 @@ PLACES = PlacePriors()
 
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
-MAX_ITERATIONS = 100
-"""Of damped Newton steps on the rotation; about ten are usual."""
-CONVERGED_TURN_RAD = 1e-13
-"""The iteration ends when the best rotation changes by less [rad]."""
+MAX_ITERATIONS = 100  # of damped Newton steps on the rotation; about ten are usual
+CONVERGED_TURN_RAD = 1e-13  # the iteration ends when the best rotation changes by less [rad]
 ROUNDING_INCREASE = 1e-12
 """Relative increase of the sum of squares that is attributed to rounding, so that the last steps are accepted."""
-SMALLEST_DAMPING_M2 = 1e-30
-"""Keeps the normal equations of a robot that does not move invertible [m^2]."""
+SMALLEST_DAMPING_M2 = 1e-30  # keeps the normal equations of a robot that does not move invertible [m^2]
 
 
 class Placement(NamedTuple):

@@ -18,16 +18,13 @@ from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.runtime.chain import smooth
 
-RIGID_TOLERANCE = 1e-6
-"""Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
+RIGID_TOLERANCE = 1e-6  # largest accepted entry of |R^T R - 1|: text files carry six digits or more
 TOLERANCE = 1e-3
 """Measured quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
-ROUNDING = 2e-15
-"""Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
+ROUNDING = 2e-15  # entries of R^T R - 1 that are rounding alone: such matrices are rotations already
 ONE_POSE = "pass one rigid transform per row, (N, 4, 4), or one for each of T tips, (N, T, 4, 4)"
 
-Place = Callable[[int], str]
-"""Names a row in messages."""
+Place = Callable[[int], str]  # names a row in messages
 
 
 def skew(vectors: Tensor) -> Tensor:

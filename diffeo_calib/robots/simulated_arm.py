@@ -35,18 +35,13 @@ from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.runtime.chain import joint_motions
 
 URDF_FILE = Path(__file__).with_name("simulated_arm.urdf")
-GRAVITY = (0.0, 0.0, -9.81)
-"""Acceleration in the robot's base, which stands upright [m/s^2]."""
-TWIST_DEVIATION = 5e-4
-"""Standard deviation of geometric errors: 0.5 mm and 0.5 mrad."""
-TRANSMISSION_RANGE = (1e-4, 3e-4)
-"""Amplitudes of each harmonic of a joint's transmission error [rad]."""
-HARMONICS, HIGHER_HARMONICS = 3, (3, 7)
-"""The third harmonic is drawn from this half-open range (waves per turn)."""
+GRAVITY = (0.0, 0.0, -9.81)  # acceleration in the robot's base, which stands upright [m/s^2]
+TWIST_DEVIATION = 5e-4  # standard deviation of geometric errors: 0.5 mm and 0.5 mrad
+TRANSMISSION_RANGE = (1e-4, 3e-4)  # amplitudes of each harmonic of a joint's transmission error [rad]
+HARMONICS, HIGHER_HARMONICS = 3, (3, 7)  # the third harmonic is drawn from this half-open range (waves per turn)
 COMPLIANCE = (3.0e-6, 4.0e-6, 6.0e-6, 2.5e-5, 3.0e-5, 4.0e-5)
 """Joint compliances [rad/(N m)]: stiffness 2.5e5 N m/rad at the shoulder, 2.5e4 at the wrist, usual for such gears."""
-PAYLOAD_CENTRE = (0.01, -0.02, 0.08)
-"""Centre of mass of the payload in the flange's frame [m]."""
+PAYLOAD_CENTRE = (0.01, -0.02, 0.08)  # centre of mass of the payload in the flange's frame [m]
 
 
 @dataclass(frozen=True, eq=False)

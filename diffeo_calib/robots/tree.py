@@ -32,8 +32,7 @@ from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.runtime.build import ROTARY, nominal_chain
 from diffeo_calib.runtime.chain import joint_motions, walk
 
-BASE = -1
-"""Stands for the base where the number of a joint is asked for."""
+BASE = -1  # stands for the base where the number of a joint is asked for
 
 
 class Ends(NamedTuple):

@@ -21,10 +21,8 @@ from diffeo_calib.common.errors import MOST_NAMES, RobotError, as_written, few, 
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 
-AXIS = (1.0, 0.0, 0.0)
-"""Axis of a joint without <axis>, by the URDF specification."""
-LARGEST_FILE = 100_000_000
-"""Bytes of a file that no URDF has; meshes are files of their own."""
+AXIS = (1.0, 0.0, 0.0)  # axis of a joint without <axis>, by the URDF specification
+LARGEST_FILE = 100_000_000  # bytes of a file that no URDF has; meshes are files of their own
 HARMLESS = {
     "ERR_UNKNOWN_VERSION": "the version in its XML declaration",
     "WAR_UNKNOWN_VERSION": "the version in its XML declaration",

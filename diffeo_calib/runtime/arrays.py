@@ -83,8 +83,7 @@ NUMPY = SimpleNamespace(
 )
 """Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py."""
 
-Tableau = tuple[Array, Array]
-"""Coefficients (s, s), strictly lower triangular, and weights (s,)."""
+Tableau = tuple[Array, Array]  # coefficients (s, s), strictly lower triangular, and weights (s,)
 
 
 @cache
@@ -102,14 +101,12 @@ def rk8() -> Tableau:
     return DOP853.A.copy(), DOP853.B.copy()
 
 
-MOST_STEPS = 1024
-"""Largest number of steps on [0, 1]: errors are pure rounding long before."""
+MOST_STEPS = 1024  # largest number of steps on [0, 1]: errors are pure rounding long before
 
 TABLEAUS: dict[str, Callable[[], Tableau]] = {"rk4": rk4, "rk8": rk8}
 
 
-LEAST_R2 = 1e-14
-"""Added to r^2 where a formula divides by r."""
+LEAST_R2 = 1e-14  # added to r^2 where a formula divides by r
 
 
 def gaussian(r2: Any, orders: Sequence[int], use: Any = NUMPY) -> Iterator[Any]:

@@ -24,8 +24,7 @@ ROTARY = ("revolute", "continuous")
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
 
-MOST_TERMS = 1000
-"""Of the errors of an axis: more are no smooth function, and a file with 10^9 would fill the memory."""
+MOST_TERMS = 1000  # of the errors of an axis: more are no smooth function, and a file with 10^9 would fill the memory
 
 
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:

@@ -20,10 +20,8 @@ import numpy as np
 
 from diffeo_calib.runtime.arrays import NUMPY, ONE, SKEW, Array, cross, skew, transforms
 
-COINCIDENT_FRAMES_M = 1e-6
-"""Frames whose origins are closer than this [m] count as one place for masses."""
-SERIES_TERMS = 11
-"""Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
+COINCIDENT_FRAMES_M = 1e-6  # frames whose origins are closer than this [m] count as one place for masses
+SERIES_TERMS = 11  # terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22
 
 
 class Waves(NamedTuple):

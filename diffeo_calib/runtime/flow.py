@@ -16,8 +16,7 @@ import numpy as np
 from diffeo_calib.runtime.arrays import FORMULAS, NUMPY, Array, combined
 from diffeo_calib.runtime.tables import JointTables, tabulated
 
-BLOCK = 1 << 16
-"""Largest number of kernel values that are held at once: they stay in the cache of the processor."""
+BLOCK = 1 << 16  # largest number of kernel values that are held at once: they stay in the cache of the processor
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
 

@@ -14,10 +14,8 @@ from diffeo_calib.runtime.arrays import Array, cross
 from diffeo_calib.runtime.chain import CalibratedChain, tip_poses
 from diffeo_calib.runtime.flow import RecordedFlow
 
-TOOL_LEVER = 0.1
-"""Distance of the three points from a tool centre point, m; orientations hardly depend on it."""
-LONGEST_TOOL = 1e3
-"""m; beyond it the three points of a tool lose digits."""
+TOOL_LEVER = 0.1  # distance of the three points from a tool centre point, m; orientations hardly depend on it
+LONGEST_TOOL = 1e3  # m; beyond it the three points of a tool lose digits
 FEW_ROWS = 64
 """Queries of more rows are limited to one thread; fewer use no more, and the limit would take longer than they do."""
 FRAMES = ("base", "measuring")

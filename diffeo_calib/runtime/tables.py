@@ -19,13 +19,10 @@ import numpy as np
 
 from diffeo_calib.runtime.arrays import FORMULAS, NUMPY, Array, as_index
 
-TOLERANCE = 1e-13
-"""Largest error of a table, rad; for fields above 1 rad relative to the largest."""
+TOLERANCE = 1e-13  # largest error of a table, rad; for fields above 1 rad relative to the largest
 FEWEST_CELLS, MOST_CELLS = 64, 16384
-CLOSEST_KNOTS_RAD = 1e-5
-"""Kinks closer than this to a knot, rad, become no knots of their own."""
-BLOCK = 1 << 14
-"""Largest number of kernel values that are held at once."""
+CLOSEST_KNOTS_RAD = 1e-5  # kinks closer than this to a knot, rad, become no knots of their own
+BLOCK = 1 << 14  # largest number of kernel values that are held at once
 TURN = 2 * np.pi
 CIRCLE_SPACING_RAD = 8.0
 """Distance between the circles of two joints on the line where all cells are searched at once; more than 2 pi."""

@@ -27,13 +27,11 @@ from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates, with_positions
 
-KNOWN_DEVIATION = 1e-8
-"""Prior deviations of increments below this, m or rad, are those of numbers that are known."""
+KNOWN_DEVIATION = 1e-8  # prior deviations of increments below this, m or rad, are those of numbers that are known
 NUMBERS_OF_A_SOCKET = 3
 REMAINING_SPREAD, SMALLEST_MOTION_M = 0.2, 1e-9
 """Largest part of the spread within sockets, relative to the tip's motion, that remains where a mistake is undone."""
-LARGEST_MEDIAN_M = 5e-3
-"""Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
+LARGEST_MEDIAN_M = 5e-3  # of readings around a calibrated robot: with larger errors it is another robot or another ball
 
 
 BALL_IS_THE_MARKER = (

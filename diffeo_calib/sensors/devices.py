@@ -33,19 +33,15 @@ T = TypeVar("T")
 MODEL_FRAME = "the frame of the model"
 Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
 """Unit in which r numbers are shown, and what they are multiplied by and shifted by to be in it."""
-SMALLEST_M = 1e-12
-"""Of a column of a linear system, against division by zero."""
-ROUNDS = 20
-"""Steps of a refinement."""
-OUTLIER_MEDIANS = 3.0
-"""Errors, in medians, from which rows lose their weight in a refinement."""
+SMALLEST_M = 1e-12  # of a column of a linear system, against division by zero
+ROUNDS = 20  # steps of a refinement
+OUTLIER_MEDIANS = 3.0  # errors, in medians, from which rows lose their weight in a refinement
 SMALLEST_MEDIAN_M = 1e-7
 SMALLEST_DISTANCE_M = 1e-6
 """Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
 
 
-MILLIMETRE = "mm", 1e-3
-"""A unit and its size, m."""
+MILLIMETRE = "mm", 1e-3  # a unit and its size, m
 CHANGE, VALUE, ROW = "change", "value", "row"
 """What a hypothesis opens: what changes at a row or drifts, one number that a device is said to hold, such as a focal
 length, or a number that differs from row to row."""

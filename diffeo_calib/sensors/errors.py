@@ -16,10 +16,8 @@ from diffeo_calib.common.quantiles import known, quantile
 from diffeo_calib.measurements.readings import SocketReadings
 
 NAMES = ("rms", "median", "p95", "max")
-SIZES = ("RMS", "median", "95 %", "max")
-"""The same in heads of tables."""
-BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")
-"""Attributes of an evaluation with a value for each row."""
+SIZES = ("RMS", "median", "95 %", "max")  # the same in heads of tables
+BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")  # attributes of an evaluation with a value for each row
 ERRORS, SPREAD, READINGS, ORIENTATION = "errors", "spread", "readings", "orientation"
 WORDS = {
     ERRORS: "distances",

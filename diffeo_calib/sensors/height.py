@@ -12,12 +12,10 @@ from diffeo_calib.common.errors import few
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.sensors.devices import Devices, across, least_squares
 
-LEAST_NORMAL = 0.5
-"""Length of a normal by least squares from which heights tell the points apart."""
+LEAST_NORMAL = 0.5  # length of a normal by least squares from which heights tell the points apart
 FLAT_SHARE = 0.2
 """Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
-PARALLEL_SINE = 0.1
-"""Of the angle between planes below which they are parallel."""
+PARALLEL_SINE = 0.1  # of the angle between planes below which they are parallel
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ from diffeo_calib.sensors.devices import (
     refuse_first,
 )
 
-VIEW_HALF_ANGLE_RAD = 0.5
-"""Of the field of view of a camera whose poses are planned: 57 degrees in all."""
+VIEW_HALF_ANGLE_RAD = 0.5  # of the field of view of a camera whose poses are planned: 57 degrees in all
 
 
 @dataclass(frozen=True, eq=False)

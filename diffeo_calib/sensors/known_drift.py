@@ -22,8 +22,7 @@ from diffeo_calib.sensors.devices import Extrinsics
 FRAME, GROWTH, OFFSETS = 6, 6, 7
 """Of the unknowns: shift and turn of the frame come first, then growth, then the joint offsets."""
 ENDS_AND_CENTRE = 5
-SURE = 3.0
-"""Standard deviations from which an unknown is reported."""
+SURE = 3.0  # standard deviations from which an unknown is reported
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from diffeo_calib.sensors.devices import (
     refuse_first,
 )
 
-FIXED_DEVIATION_M = 1e-9
-"""Prior standard deviation of an offset that is known to be zero."""
+FIXED_DEVIATION_M = 1e-9  # prior standard deviation of an offset that is known to be zero
 UNKNOWN_ZERO_M = 1.0
 ZERO_WARNED, ZERO_REFUSED = 1.35, 5.0
 """Factors by which a free zero lowers the noise that the geometric calibration leaves, from which the zero is warned

@@ -29,16 +29,12 @@ from diffeo_calib.sensors.devices import Extrinsics
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-FEWEST_ROWS = 4
-"""Rows of a session from which its frame, or what is on the tool, is found."""
-GROSS_DISTANCES = 10.0
-"""Rows that are farther than this many median distances take no part."""
+FEWEST_ROWS = 4  # rows of a session from which its frame, or what is on the tool, is found
+GROSS_DISTANCES = 10.0  # rows that are farther than this many median distances take no part
 ROUNDS = 3
-SESSION, MOUNTING, MOUNTED_FRAME = "session", "mounting", "mounted frame"
-"""Kinds of what a model keeps of them."""
+SESSION, MOUNTING, MOUNTED_FRAME = "session", "mounting", "mounted frame"  # kinds of what a model keeps of them
 NUMBERS_OF_A_FRAME = 6
-ROWS = "these rows"
-"""Name of the set-up of rows that name none."""
+ROWS = "these rows"  # name of the set-up of rows that name none
 View = Callable[[Tensor], Tensor]
 """Poses (M, 4, 4) of a model's tool in its measuring frame -> those that a set-up measures, m."""
 Turns = Callable[[Tensor], Tensor]
@@ -319,8 +315,7 @@ class MountedFrames(SetUps):
         return f"'{self.names[number]}' is {away}"
 
 
-TRANSFORMS = SESSION, MOUNTED_FRAME
-"""Kinds whose constants are transforms."""
+TRANSFORMS = SESSION, MOUNTED_FRAME  # kinds whose constants are transforms
 
 
 def set_up_kind(data: Measurements) -> type[SetUps]:

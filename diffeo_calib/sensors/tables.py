@@ -25,8 +25,7 @@ class Rows(NamedTuple):
     rows: Tensor
 
 
-Coordinates = OtherReadings = Rows
-"""Rows that tell coordinates, of positions and poses; readings of one kind."""
+Coordinates = OtherReadings = Rows  # rows that tell coordinates, of positions and poses; readings of one kind
 
 
 def rows_of_one_kind(data: Any) -> list[Rows]:

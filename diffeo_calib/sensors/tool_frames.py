@@ -30,8 +30,7 @@ from diffeo_calib.robots.placement import PLACES, place
 from diffeo_calib.robots.se3 import nearest_rotations
 from diffeo_calib.sensors.devices import Devices, Extrinsics, least_squares, moved_pose
 
-ALIKE = 0.05
-"""Deviation of a block's distance from one place to another, relative to that of the distance itself."""
+ALIKE = 0.05  # deviation of a block's distance from one place to another, relative to that of the distance itself
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 

@@ -44,8 +44,7 @@ MAX_MARKERS_FOR_EXCHANGE, MOST_OUTLIERS = 12, 10
 """Number of markers up to which exchanged pairs are looked for, and most lines about single rows."""
 MOST_ROWS, MOST_EXPECTED = 500, 100
 """Rows that are looked at, and those of them in which the typical expected error is found."""
-OF_DEVIATIONS = "std_"
-"""Prefix of columns of known standard deviations, which may well be equal."""
+OF_DEVIATIONS = "std_"  # prefix of columns of known standard deviations, which may well be equal
 
 
 @dataclass(frozen=True)

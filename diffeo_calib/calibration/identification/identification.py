@@ -28,12 +28,10 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
 
-SMALLEST_NOISE_M = 1e-6
-"""Lower bound of the noise; no device that measures a robot resolves less."""
+SMALLEST_NOISE_M = 1e-6  # lower bound of the noise; no device that measures a robot resolves less
 ROUNDS, NOISE_CHANGE = 10, 3e-3
 """Most rounds of estimation, and the relative change of the noise at which they have converged."""
-SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
-"""Range of estimated prior deviations, m or rad."""
+SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1  # range of estimated prior deviations, m or rad
 SHARED_NUMBERS = 3.0
 """Numbers as which the noise of all kinds counts for that of one, in logarithms: of a few rows nothing may be left."""
 COORDINATES = 8000

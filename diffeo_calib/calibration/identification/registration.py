@@ -96,12 +96,9 @@ def can_register(points: Tensor) -> bool:
     return enough and bool(seen_markers(points).any(0).all())
 
 
-ROUNDS = 30
-"""Most rounds of weighing rows."""
-SETTLED = 1e-6
-"""Largest change of a weight at which these rounds end."""
-HALF_WEIGHT_MEDIANS = 2.0
-"""Distance, in medians, at which a row has half its weight."""
+ROUNDS = 30  # most rounds of weighing rows
+SETTLED = 1e-6  # largest change of a weight at which these rounds end
+HALF_WEIGHT_MEDIANS = 2.0  # distance, in medians, at which a row has half its weight
 
 
 class SocketRegistration(NamedTuple):
@@ -160,8 +157,7 @@ def _means(values: Tensor, socket: Tensor, weights: Tensor) -> Tensor:
 OFFSET_STD, FREE_STD = 0.5, 10.0
 """Prior standard deviations, rad or m: of a joint offset, which only chooses among offsets that poses cannot separate,
 and of base and markers beside them, no constraint."""
-INLIER_ERROR = 0.1
-"""Error of a coordinate, relative to the median distance, beyond which Huber's loss grows linearly."""
+INLIER_ERROR = 0.1  # error of a coordinate, relative to the median distance, beyond which Huber's loss grows linearly
 MAX_EVALUATIONS = 100
 
 
@@ -210,15 +206,13 @@ GROSS_DISTANCES, GROSS_ROUNDS = 10.0, 5
 DRAWS, SURPLUS = 50, 2
 """Registrations of random rows that are tried if there may be many gross outliers, and their size as a multiple of the
 rows that are needed: with 30 % outliers all of six rows are inliers with probability 0.12."""
-CONSISTENT = 0.02
-"""Residual, a median distance relative to the spread of the markers, with which rows need no draws."""
+CONSISTENT = 0.02  # residual, a median distance relative to the spread of the markers, with which rows need no draws
 EXAMINED, ACCEPTED, REMAINING = 0.01, 0.02, 0.3
 """Such residuals from which joint offsets are estimated and that may remain with them, and which part may remain."""
 LARGEST_OFFSET_RAD, WORSE = 0.8, 1.1
 """Largest offset of a turning joint that is accepted, and largest noise of a geometric calibration with offsets in that
 of one without."""
-REPORTED = 0.2
-"""Smallest offset that is reported, as a part of the largest."""
+REPORTED = 0.2  # smallest offset that is reported, as a part of the largest
 
 
 def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, Tensor]:

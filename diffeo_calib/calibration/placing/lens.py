@@ -30,8 +30,7 @@ ON_TOOL = {MARKERS: "the camera on the tool", BASE: "the board, or the robot's b
 FIXED = {MARKERS: "the board on the tool", BASE: "the camera, or the robot's base"}
 """What is on the tool and what stands."""
 ROUNDS = 5
-PARTS = slice(0, len(LENS)), slice(len(LENS), None)
-"""Lens and board among the unknowns of a camera."""
+PARTS = slice(0, len(LENS)), slice(len(LENS), None)  # lens and board among the unknowns of a camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,8 +121,7 @@ def stacked(
 
 
 LOG = logging.getLogger(__name__)
-MOST_SAGS = 5000
-"""Unknowns of gravity sag, of which there are 4.5 n^2 of n joints: matrices of so many take 200 MB."""
+MOST_SAGS = 5000  # unknowns of gravity sag, of which there are 4.5 n^2 of n joints: matrices of so many take 200 MB
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,8 +199,7 @@ def reading_sets(readings: Sequence[OtherReadings], devices: Sequence[Devices]) 
 
 # --- where a fit starts -----------------------------------------------------------------------------------------------
 
-ROUGH_M = 2e-3
-"""Errors of a robot before its calibration, to compare starts."""
+ROUGH_M = 2e-3  # errors of a robot before its calibration, to compare starts
 STARTS_STEPS, COMPARED = 200, 1e-3  # most steps; change of the cost by which those end that are only compared
 BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
 """Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
@@ -212,8 +211,7 @@ LARGEST_SHARE, DOUBTED_SHARE, FAR_BETTER = 0.02, 0.002, 0.2
 part that the right unit leaves."""
 BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
 """Of the ball on the tool by images of unknown cameras, m."""
-FEWEST_IMAGES = 8
-"""Rows of a camera from which a projection, 11 numbers, can be contradicted."""
+FEWEST_IMAGES = 8  # rows of a camera from which a projection, 11 numbers, can be contradicted
 
 
 def resting_rows(tables: Sequence[Any]) -> list[SocketReadings]:

@@ -43,8 +43,7 @@ from diffeo_calib.sensors.set_ups import (
 from diffeo_calib.sensors.tables import Coordinates
 
 ROUNDS = 3
-TOLD_APART = 0.5
-"""Ratio of median residuals below which one account of what differs between sessions is clearly better."""
+TOLD_APART = 0.5  # ratio of median residuals below which one account of what differs between sessions is clearly better
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from diffeo_calib.robots.tree import Tree
 
 POINTS_PER_LINK = 8  # points of each link that are checked: 8 cm apart on a link of 0.6 m
 
-Criterion = Callable[[Tensor], Any]
-"""Configurations (N, n) -> (N,) boolean, whether each is allowed."""
+Criterion = Callable[[Tensor], Any]  # configurations (N, n) -> (N,) boolean, whether each is allowed
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,7 @@ from diffeo_calib.regression.tails import Tails, estimated
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
-SMALLEST_FREEDOM = 8.0
-"""Lower bound of the degrees of freedom with which the data determine the scale of all variances."""
+SMALLEST_FREEDOM = 8.0  # lower bound of the degrees of freedom with which the data determine the scale of all variances
 
 
 @dataclass(frozen=True)
@@ -140,20 +139,14 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
 
-FEWEST_OUTSIDE = 100
-"""Rows, or motions, outside of the sample on which scales were chosen from which these judge them."""
-MOST_COORDINATES = 3000
-"""Measured coordinates of a random part that stands for all rows where there are more."""
+FEWEST_OUTSIDE = 100  # rows, or motions, outside of the sample on which scales were chosen from which these judge them
+MOST_COORDINATES = 3000  # measured coordinates of a random part that stands for all rows where there are more
 FOLDS, ITERATIONS = 5, 10
 """Number of folds, at most one for each configuration; iterations of the search for scales without a fold."""
-NEAR = 0.2
-"""Distance of consecutive rows, relative to that of any two, below which they belong to one motion."""
-FEWEST_MOTIONS = 5
-"""Below which repeats alone are left out together."""
-OUTLIER_WEIGHT = 0.05
-"""Of a row below which it is a gross error, which no region is meant to hold."""
-FEWEST_PLACES = 2
-"""Places that a single one counts as: without a second one nothing can be left out."""
+NEAR = 0.2  # distance of consecutive rows, relative to that of any two, below which they belong to one motion
+FEWEST_MOTIONS = 5  # below which repeats alone are left out together
+OUTLIER_WEIGHT = 0.05  # of a row below which it is a gross error, which no region is meant to hold
+FEWEST_PLACES = 2  # places that a single one counts as: without a second one nothing can be left out
 HALVINGS, FEWEST_HALVED, PART_MODES = 5, 100, 3
 """How often the space of commanded poses is halved into parts that are left out, rows from which it is, and directions
 in which the error of a part is judged."""

@@ -53,10 +53,8 @@ from diffeo_calib.regression.tails import Tails
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
 FREEDOM_OF_POSES = 6
-SLACK_SHARE = 0.1
-"""Noise of the single points of a pose, relative to the residual of the geometric calibration."""
-FINEST_SHARE = 0.3
-"""The same relative to the finest direction of known errors: it adds a tenth to their variance."""
+SLACK_SHARE = 0.1  # noise of the single points of a pose, relative to the residual of the geometric calibration
+FINEST_SHARE = 0.3  # the same relative to the finest direction of known errors: it adds a tenth to their variance
 
 
 @dataclass(frozen=True)
@@ -231,10 +229,8 @@ def differing_factor(covariance: Tensor, mean: Tensor, measured: Tensor) -> floa
 
 
 LOG = logging.getLogger(__name__)
-PRIOR_M = 0.3
-"""Prior standard deviation of the point around the board's origin, m: the size of usual boards."""
-SAME_BOARD_M = 1e-6
-"""Boards of several sessions, brought into one frame, are farther apart than this."""
+PRIOR_M = 0.3  # prior standard deviation of the point around the board's origin, m: the size of usual boards
+SAME_BOARD_M = 1e-6  # boards of several sessions, brought into one frame, are farther apart than this
 
 
 def with_best_seen_point(data: Measurements, fit: Identification) -> Measurements:

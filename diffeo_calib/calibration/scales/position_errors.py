@@ -39,28 +39,21 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.runtime.build import axis_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles
 
-MEDIAN_OF_CHANCE = 2.0 * log(2.0)
-"""Median of chi-squared with two degrees of freedom."""
-SMALLEST_CORNER = 1e-6
-"""Smallest eigenvalue of A relative to the largest at which cosine and sine can be told apart."""
+MEDIAN_OF_CHANCE = 2.0 * log(2.0)  # median of chi-squared with two degrees of freedom
+SMALLEST_CORNER = 1e-6  # smallest eigenvalue of A relative to the largest at which cosine and sine can be told apart
 
 
-LOWEST, HIGHEST, STEP = 8.0, 420.0, 0.04
-"""Frequencies of the scan, rad per rad."""
-BINS = 1 << 18
-"""Of the Fourier transforms, a power of two."""
-FEWEST_POSES = 60
-"""Different poses below which there is no scan."""
+LOWEST, HIGHEST, STEP = 8.0, 420.0, 0.04  # frequencies of the scan, rad per rad
+BINS = 1 << 18  # of the Fourier transforms, a power of two
+FEWEST_POSES = 60  # different poses below which there is no scan
 PER_SCALE = 6
 """Measured coordinates for each scale below which there is none: scales that were overfitted make the noise too small
 and lines of chance (17 joints, 150 poses of one marker)."""
-MOST_COORDINATES = 3000
-"""Measured coordinates in the scan."""
+MOST_COORDINATES = 3000  # measured coordinates in the scan
 FALSE_ALARMS = 0.001
 """Share of robots without lines on which chance alone makes one. Real residuals are not quite white: at one in twenty a
 UR10 showed a line in one series that was not there in another."""
-CLEARANCE = 6.0
-"""Fall of the sum of squares by which a line must surpass other frequencies that explain the same."""
+CLEARANCE = 6.0  # fall of the sum of squares by which a line must surpass other frequencies that explain the same
 MOST_LINES = 20
 
 
@@ -216,8 +209,7 @@ GRID = (0.1, 0.3, 1.0, 3.0), (0.1, 0.2, 0.4, 0.8)
 """Turns per shift, rad/m, of which either shrinks further in the search, but would hardly grow from zero, and length
 scales, as a part of the range. First the middle is tried alone."""
 SHIFTS_M = torch.logspace(-6, -2, 25, dtype=torch.float64, device="cpu")
-PLAUSIBLE = 3.0
-"""Log odds in the middle of the grid below which the rest is not tried."""
+PLAUSIBLE = 3.0  # log odds in the middle of the grid below which the rest is not tried
 STILL, TOLD_APART = 1e-3, 6.0
 """Range of a joint, rad or m, below which its axis is not sought. Log odds by which a base that drifts explains the
 rows better than an axis."""

@@ -32,22 +32,18 @@ MESHING_LENGTHSCALE_RAD = 0.22
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
 (tens of periods per turn) and eccentricity (one)."""
-OBJECTIVE_OF_FAILURE = 1e12
-"""Objective where G + R cannot be factorised: the line search then shortens its step."""
+OBJECTIVE_OF_FAILURE = 1e12  # objective where G + R cannot be factorised: the line search then shortens its step
 LARGEST_GAIN = 1e5
 """Variance by an unknown, relative to that of the fields and the noise, up to which it costs no digits among them; a
 factor of its own for all unknowns would take half as long again."""
 
 
-POSES, COORDINATES = 150, 900
-"""Largest number of poses, and of measured coordinates, in the likelihood."""
-ITERATIONS = 40
-"""Of the optimiser from a given start, at most."""
+POSES, COORDINATES = 150, 900  # largest number of poses, and of measured coordinates, in the likelihood
+ITERATIONS = 40  # of the optimiser from a given start, at most
 FIRST, FEWEST_FIRST, MOST_FIRST, FIRST_COORDINATES = 20, 15, 60, 450
 """Iterations from each of several starts with so many measured coordinates, at least, and at most: fewer coordinates
 cost less per iteration and have more local optima, and get more iterations."""
-LOG_RANGE = 9.0
-"""Bound on the logarithm of a scale relative to its default."""
+LOG_RANGE = 9.0  # bound on the logarithm of a scale relative to its default
 
 LENGTH, GROWTH, SHRINKAGE = 1.0, 1.0, 2.0
 """Log-normal prior of the scales around their defaults, standard deviations in e-folds: of length scales and noise, of
@@ -56,8 +52,7 @@ AXES = 0.3
 """The same of each axis of commanded poses or places around the mean of the slides, or of the turns. The axes of such a
 frame are a choice: fields look alike along all of them unless the rows say otherwise. Scales that were free for each
 axis would fit 20 poses too well, and the regions of a hand-eye transform would hold 0.90 for 0.95."""
-SHORT = 0.3
-"""Of the default length scales and noise."""
+SHORT = 0.3  # of the default length scales and noise
 
 
 @dataclass(frozen=True)
@@ -218,10 +213,8 @@ SMALLEST_LEVER = 1e-12
 SMALLEST_HALF_RANGE_M, SMALLEST_RATIO = 5e-3, 50.0
 """Of a slide's values, and in units of the noise: the encoder of one that stands still tells values apart that mean
 nothing, and a field would fold a shorter kernel's space."""
-SMALLEST_SPREAD_M = 1e-3
-"""Of the markers."""
-SMALLEST_LOAD_M = 1e-9
-"""Displacement per unit coefficient."""
+SMALLEST_SPREAD_M = 1e-3  # of the markers
+SMALLEST_LOAD_M = 1e-9  # displacement per unit coefficient
 
 
 def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:

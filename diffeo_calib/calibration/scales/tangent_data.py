@@ -32,8 +32,7 @@ from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES
 
 T = TypeVar("T")
-HELD_VARIANCE = 1e-18
-"""Prior variance of parameters that stay zero, m^2 or rad^2: a nanometre."""
+HELD_VARIANCE = 1e-18  # prior variance of parameters that stay zero, m^2 or rad^2: a nanometre
 KEPT_COORDINATES = 1500
 """Measured coordinates up to which the last matrices are kept, for weights, gear lines and leave-one-out errors."""
 LINEARISED = ("points", "slopes", "values", "jacobian", "sensitivities")

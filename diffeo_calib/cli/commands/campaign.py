@@ -35,8 +35,7 @@ from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
 LOOK_SECONDS = 0.1
-LONGEST = 200
-"""Characters of an option in a journal; of longer ones it holds a hash."""
+LONGEST = 200  # characters of an option in a journal; of longer ones it holds a hash
 
 
 @dataclass

@@ -30,15 +30,13 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
 AXES_OF_A_POSE = 6
-ROWS_AT_ONCE = 100
-"""Rows whose deviations are predicted together."""
+ROWS_AT_ONCE = 100  # rows whose deviations are predicted together
 REASONS = {
     "unreachable": "unreachable with corrections within --limit",
     "singular": "singular: near a singularity it needs a correction larger than --limit",
 }
 """Statuses in words: the largest correction is part of them."""
-MOST_MISSED = 10
-"""Most lines about rows that are not reached."""
+MOST_MISSED = 10  # most lines about rows that are not reached
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,11 +35,9 @@ from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
-LARGE_SHARE = 0.5
-"""Of the expected error, from which the robot's size is said to be worth measuring."""
+LARGE_SHARE = 0.5  # of the expected error, from which the robot's size is said to be worth measuring
 
-Errors = dict[str, dict[str, Evaluation]]
-"""Errors by the kind of rows and by stage."""
+Errors = dict[str, dict[str, Evaluation]]  # errors by the kind of rows and by stage
 
 
 def run(given: FitOptions) -> None:

@@ -39,10 +39,8 @@ from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
 
-NOT_RAISED = 1.01
-"""Ratio of residuals without and with a joint up to which the markers do not follow it."""
-FLANGES = ("flange", "tool0")
-"""Ends of the names of links to which tools are screwed."""
+NOT_RAISED = 1.01  # ratio of residuals without and with a joint up to which the markers do not follow it
+FLANGES = ("flange", "tool0")  # ends of the names of links to which tools are screwed
 
 
 def run(given: InitOptions) -> None:

@@ -142,8 +142,7 @@ def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list
 
 MOVED = {"base": "the measuring device is", "marker": "the markers are", "both": "device and markers are"}
 """What --free names, in words."""
-OPEN_M = 0.01
-"""Expected error from which it is the place of what has moved."""
+OPEN_M = 0.01  # expected error from which it is the place of what has moved
 
 
 def _show(proposal: Plan, *, of_positions: bool, free: str | None) -> None:

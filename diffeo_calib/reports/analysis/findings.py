@@ -34,10 +34,8 @@ from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.tables import divided, measured_positions
 
 LOG = logging.getLogger(__name__)
-STEPS = 4
-"""Of the analysis, as they are told."""
-FAR_RATIO = 3.0
-"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
+STEPS = 4  # of the analysis, as they are told
+FAR_RATIO = 3.0  # ratio of expected errors anywhere to those like the measured ones from which the reason is told
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 

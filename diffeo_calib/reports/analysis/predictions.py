@@ -35,17 +35,13 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.errors import Evaluation
 
-WHOLE_COORDINATES = 4500
-"""Measured coordinates up to which each row is predicted by all others."""
+WHOLE_COORDINATES = 4500  # measured coordinates up to which each row is predicted by all others
 BLOCK_COORDINATES = 1500
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
-LEARNING_SUBSETS = 5
-"""Random orders of the rows over which a learning curve is averaged."""
+LEARNING_SUBSETS = 5  # random orders of the rows over which a learning curve is averaged
 LEARNING_SHARES = (0.1, 0.15, 0.25, 0.4, 0.6, 0.8)
-FEWEST_LEARNED = 15
-"""Rows from which a learning curve starts."""
-OUTLIER_NOISE = 4.0
-"""Variance, in typical ones, above which the noise of a row is that of an outlier."""
+FEWEST_LEARNED = 15  # rows from which a learning curve starts
+OUTLIER_NOISE = 4.0  # variance, in typical ones, above which the noise of a row is that of an outlier
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
 """Claimed shares at which a model's uncertainty is compared with the errors found."""
 

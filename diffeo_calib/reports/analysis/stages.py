@@ -102,8 +102,7 @@ class Deviations:
 
 FEWEST_REPEATS = 5
 """Measurements beyond the first of every pose from which their deviation says something about the robot."""
-STANDARD_REPEATS = 30
-"""Attainments of every pose that ISO 9283 asks for."""
+STANDARD_REPEATS = 30  # attainments of every pose that ISO 9283 asks for
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,20 +31,15 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
 from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
 
-UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
-"""Panels with a legend or title of several lines above them."""
+UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)  # panels with a legend or title of several lines above them
 FLATTERING = {
     "spread": "A spread within sockets is no error: what all rows of a socket share does not show in it.",
     "readings": "Errors of readings do not show what no reading sees, such as the robot's size with heights.",
 }
-PER_LETTER = 0.066
-"""Width of a letter of a panel, inches."""
-OPEN_SHARE = 0.8
-"""Share of the prior deviation above which a correction is open."""
-MOST_POINTS = 600
-"""Places of the scene."""
-SCENE_DECIMALS = 5
-"""Decimals of a length in m that a scene needs: 10 um at 1 m."""
+PER_LETTER = 0.066  # width of a letter of a panel, inches
+OPEN_SHARE = 0.8  # share of the prior deviation above which a correction is open
+MOST_POINTS = 600  # places of the scene
+SCENE_DECIMALS = 5  # decimals of a length in m that a scene needs: 10 um at 1 m
 
 
 def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability: float | None) -> Iterator[Picture]:
@@ -192,10 +187,8 @@ def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
     return Table("Geometry corrections with their standard deviations", header, rows)
 
 
-LISTED_ROWS = 5
-"""Rows with the largest errors that are listed."""
-MOST_REPEATS = 12
-"""Repeated poses that are listed."""
+LISTED_ROWS = 5  # rows with the largest errors that are listed
+MOST_REPEATS = 12  # repeated poses that are listed
 
 
 def trust(findings: Findings) -> Section:

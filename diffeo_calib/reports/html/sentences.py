@@ -13,10 +13,8 @@ from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
-ENOUGH_FOR_P95 = 20
-"""Rows from which a 95th percentile means something."""
-BAD_RATIO = 1.5
-"""Ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named."""
+ENOUGH_FOR_P95 = 20  # rows from which a 95th percentile means something
+BAD_RATIO = 1.5  # ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named
 
 
 MISCALIBRATION_PROBABILITY = 0.05

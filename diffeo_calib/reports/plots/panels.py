@@ -26,18 +26,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-POINTS = 120
-"""Values of a joint at which its transmission error is drawn."""
-HISTOGRAM_BINS = 24
-"""Intervals of the measured values below it."""
-WIDE_RATIO = 20.0
-"""Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
+POINTS = 120  # values of a joint at which its transmission error is drawn
+HISTOGRAM_BINS = 24  # intervals of the measured values below it
+WIDE_RATIO = 20.0  # ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis
 BINS, FEWEST_IN_BIN = 10, 3
-PART_WIDTH = 4.7
-"""Width of the figure of the parts, inches."""
+PART_WIDTH = 4.7  # width of the figure of the parts, inches
 TWO_SIDED_95 = 1.96
-LONGEST_NAME = 36
-"""Letters of a name in a panel."""
+LONGEST_NAME = 36  # letters of a name in a panel
 
 
 def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, joint: int) -> None:
@@ -136,8 +131,7 @@ def joint_label(robot: Tree, joint: int) -> str:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SMALLEST_ERROR = 1e-9
-"""Smaller errors in mm, px or deg are drawn as this one: a logarithmic axis has no zero."""
+SMALLEST_ERROR = 1e-9  # smaller errors in mm, px or deg are drawn as this one: a logarithmic axis has no zero
 
 
 def draw_distributions(
@@ -178,8 +172,7 @@ def _sizes(evaluation: Evaluation) -> np.ndarray:
     return np.maximum(evaluation.shown[1] * known(evaluation.errors).numpy(), SMALLEST_ERROR)
 
 
-FEWEST_BINNED = 30
-"""Values from which a line of RMS errors is drawn through residuals."""
+FEWEST_BINNED = 30  # values from which a line of RMS errors is drawn through residuals
 
 
 def draw_coverage(axes: Axes, predictions: Predictions) -> None:
