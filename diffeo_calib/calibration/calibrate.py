@@ -240,7 +240,7 @@ def _result(
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    chosen_scales = len(data.x) >= FEWEST_POSES  # beside defaults chance makes rows and lengths doubtful
+    chosen_scales = int(placed.data.groups().max()) + 1 >= FEWEST_POSES  # else chance makes rows and lengths doubtful
     least = 1.0 if chosen_scales else gates.UNCHOSEN_FACTOR
     explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")

@@ -146,6 +146,7 @@ class CalibrationResult:
         now = [kind.devices for kind in self.readings]
         devices = (self.registration.devices, self.identification.devices, now)[STAGES.index(stage)]
         others = [kind.devices for kind in self.placement if not kind.devices.reads]
+        others = [each for each in others if stage == CALIBRATED or not each.cameras]  # first images know no lens yet
         return Places(joined([*others, *devices]), self.placed.ball)
 
     def errors(self, data: Any) -> dict[str, dict[str, Evaluation]]:

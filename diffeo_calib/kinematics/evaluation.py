@@ -63,7 +63,8 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     flags = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
     turns, parts = None if model is None else model.turns, rows_of_one_kind(data)
     beside = Beside(partial(predicted_at, kinematics), known_devices(kinematics), turns, **flags)
-    places = Places(ball=len(parts) > 1 if model is None else model.ball)
+    cameras = {kind: devices for kind, devices in beside.known.items() if devices.cameras}
+    places = Places(cameras, ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
         places = places.beside(sensor_of(table).place(table, beside))
     drift = KnownDrift.of(kinematics)

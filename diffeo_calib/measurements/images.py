@@ -28,6 +28,7 @@ FEWEST_IMAGES = 8  # from which a free lens is well enough known to be compared
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
 ONLY_CAMERA = "camera"  # name of a camera that is alone
+MOVED = 1e-3  # of a pose beside that of its own image, m and rad, from which rows are in another frame
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
@@ -205,12 +206,19 @@ class ImageTable(RowGroups):
         return with_attributes(self, **columns, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
 
     def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
-        """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ."""
+        """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ.
+
+        Rows that were moved since into another frame than that of their images stay as they are.
+        """
         known = {name: cameras[name] for name in self.cameras if name in cameras}
         if not known or any(name not in known or not own.alike(known[name]) for name, own in self.cameras.items()):
             return self
-        how = {"seen_by": self.camera_names, "camera_on_tool": self.board is not None, "doubt": False}
-        again = self.from_images(self.q, self.corners, known, self.joint_names, **how)
+        how: Any = {"camera_on_tool": self.board is not None, "doubt": False}
+        of_first = {"seen_by": self.camera_names[:1]} | how
+        first = self.from_images(self.q[:1], self.corners[:1], self.cameras, self.joint_names, **of_first).poses
+        if first is None or float((first - self.poses[:1]).abs().max()) > MOVED:
+            return self
+        again = self.from_images(self.q, self.corners, known, self.joint_names, seen_by=self.camera_names, **how)
         columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
         columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
         return with_attributes(self, **columns)

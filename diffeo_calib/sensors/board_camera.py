@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -108,6 +109,10 @@ class BoardCameras(Extrinsics):
     def cameras(self) -> dict[str, BoardCamera]:
         each = zip(self.names, map(BoardCamera.of, self.constants), strict=True)
         return {name: camera for name, camera in each if camera is not None}
+
+    def aligned(self, data: Any) -> Any:
+        """Images with what these know of lens and board: a model is compared with what its own cameras see."""
+        return data.with_earlier({name: device.camera for name, device in self.cameras.items()})
 
     def sentences(self) -> list[str]:
         """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""

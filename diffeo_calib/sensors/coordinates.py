@@ -53,7 +53,7 @@ class Places:
 
     def aligned(self, data: Any) -> Any:
         """Measured positions in the frame of the model."""
-        for part in self.devices.values():
+        for part in sorted(self.devices.values(), key=lambda part: not part.cameras):  # frames are of what these see
             data = part.aligned(data)
         return data
 

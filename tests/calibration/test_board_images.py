@@ -56,6 +56,19 @@ def test_lens_and_board_are_found_with_the_robot() -> None:
     assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
 
 
+def test_a_model_is_compared_with_what_its_own_camera_sees() -> None:
+    """Images alone put a board that is larger than was said nearer than it is: no error of the robot."""
+    unknowns = true_camera().unknowns.clone()
+    unknowns[UNKNOWNS.index("scale")] = 2e-3
+    q, corners = replace(arm(), camera=replace(true_camera(), unknowns=unknowns)).shown(0.1, 11)
+    images = of_corners(corners, q, board=BoardPrior(scale=5e-3))
+    result = dc.calibrate(arm().arm.nominal, images, hyperparameters=calibrated().selection.scales)
+    errors = next(iter(result.errors(images).values()))
+    assert errors["calibrated"].rms < errors["geometric"].rms
+    assert dc.evaluate(result.model, images).rms == pytest.approx(errors["calibrated"].rms)
+    assert result.model.summary.diffeomorphic_rms == pytest.approx(errors["calibrated"].rms)
+
+
 def test_what_a_model_knows_of_the_lens_counts_until_it_changes() -> None:
     known, count, truth = calibrated().model.placement[0].cameras["camera"].camera, 20, true_camera()
     q, corners = arm().shown(0.1, 11)

@@ -189,8 +189,12 @@ class Placed:
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is None:
             return [None] * len(kinematics)
-        places = Places(ball=self.ball)
-        return [residuals(stage, places, self.coordinates.table).positions_rms for stage in kinematics]
+        table, first = self.coordinates.table, Places(ball=self.ball)
+        last = Places({kind.devices.kind: kind.devices for kind in self.placement if kind.devices.cameras}, self.ball)
+        return [
+            residuals(stage, places, table).positions_rms
+            for stage, places in zip(kinematics, (first, first, last), strict=True)
+        ]
 
     def tangent_data(self, opened: Tensor | None = None) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""

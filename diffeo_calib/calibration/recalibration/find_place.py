@@ -11,6 +11,7 @@ gross go first, together: they may hide each other.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, log
 from typing import Any
@@ -112,13 +113,7 @@ def find_place(
         placed[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        scale = max(1.0, float(scale_of([*placed.values()][-1])[0]))  # large errors under the widest prior are none
-        logs = {
-            name: rows.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, rows in placed.items()
-        }
-        odds = {name: exp(value - max(logs.values())) for name, value in logs.items()}
-        likely = {name: share for name, share in odds.items() if share > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-        odds = {name: share / sum(likely.values()) for name, share in likely.items()}
+        odds = _odds(placed)
         best = placed[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
@@ -139,6 +134,15 @@ def find_place(
         rms_before=_rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if search.known else None,
         same_place=odds.get("same", 0.0) if len(priors) > 1 else None,
     )
+
+
+def _odds(placed: Mapping[str, NewRows]) -> dict[str, float]:
+    """Probability of each prior of the markers, without those that hardly count."""
+    scale = max(1.0, float(scale_of([*placed.values()][-1])[0]))  # large errors under the widest prior are none
+    logs = {name: rows.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, rows in placed.items()}
+    odds = {name: exp(value - max(logs.values())) for name, value in logs.items()}
+    likely = {name: share for name, share in odds.items() if share > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+    return {name: share / sum(likely.values()) for name, share in likely.items()}
 
 
 @dataclass(frozen=True, eq=False)
