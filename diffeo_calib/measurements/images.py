@@ -14,7 +14,7 @@ from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
-from diffeo_calib.measurements.poses import of_frames, points_of_frames, pose_jacobian
+from diffeo_calib.measurements.poses import frames_of_points, of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import RowGroups, with_attributes
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ FEWEST_IMAGES = 8  # from which a free lens is well enough known to be compared
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
 ONLY_CAMERA = "camera"  # name of a camera that is alone
-MOVED = 1e-3  # of a pose beside that of its own image, m and rad, from which rows are in another frame
+MOVED = 1e-3  # of a pose from that in its image, m and rad, from which a row is in another frame
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
@@ -208,20 +208,34 @@ class ImageTable(RowGroups):
     def with_earlier(self, cameras: Mapping[str, Camera]) -> Self:
         """The rows with what earlier images of the same cameras showed of lenses and board, unless these differ.
 
-        Rows that were moved since into another frame than that of their images stay as they are.
+        Rows that were moved into another frame since stay there.
         """
         known = {name: cameras[name] for name in self.cameras if name in cameras}
         if not known or any(name not in known or not own.alike(known[name]) for name, own in self.cameras.items()):
             return self
-        how: Any = {"camera_on_tool": self.board is not None, "doubt": False}
-        of_first = {"seen_by": self.camera_names[:1]} | how
-        first = self.from_images(self.q[:1], self.corners[:1], self.cameras, self.joint_names, **of_first).poses
-        if first is None or float((first - self.poses[:1]).abs().max()) > MOVED:
-            return self
-        again = self.from_images(self.q, self.corners, known, self.joint_names, seen_by=self.camera_names, **how)
+        how = {"seen_by": self.camera_names, "camera_on_tool": self.board is not None, "doubt": False}
+        first, again = (
+            self.from_images(self.q, self.corners, cameras, self.joint_names, **how)
+            for cameras in (self.cameras, known)
+        )
+        moved = self.frames[:, 0] @ torch.linalg.inv(first.frames[:, 0])
+        still = torch.eye(4, dtype=moved.dtype, device=moved.device)
+        again = again.in_frames(torch.where((moved - still).abs().amax((1, 2), keepdim=True) < MOVED, still, moved))
         columns = {name: getattr(again, name) for name in ("poses", "board", "cameras", *OF_POSES)}
         columns |= {"points": points_of_frames(again.frames, self.lever), "file_sha256": self.sha256}
         return with_attributes(self, **columns)
+
+    def seen_with(self, cameras: Mapping[str, Camera]) -> Self:
+        """The points by lenses and boards of other cameras, to first order and row by row, unless these differ."""
+        if any(name not in cameras or not own.alike(cameras[name]) for name, own in self.cameras.items()):
+            return self
+        for shared in self.shared_errors():
+            roots = torch.cat([own.root for own in self.cameras.values()])
+            away = torch.cat([cameras[name].unknowns - own.unknowns for name, own in self.cameras.items()])
+            errors = torch.linalg.lstsq(roots, away, driver="gelsd").solution
+            points = self.points - (shared.slopes @ errors).view_as(self.points)
+            return with_attributes(self, points=points, poses=of_frames(frames_of_points(points, self.lever)))
+        return self
 
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.

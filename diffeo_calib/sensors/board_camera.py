@@ -112,7 +112,7 @@ class BoardCameras(Extrinsics):
 
     def aligned(self, data: Any) -> Any:
         """Images with what these know of lens and board: a model is compared with what its own cameras see."""
-        return data.with_earlier({name: device.camera for name, device in self.cameras.items()})
+        return data.seen_with({name: device.camera for name, device in self.cameras.items()})
 
     def sentences(self) -> list[str]:
         """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""

@@ -185,6 +185,7 @@ class Positions(Sensor):
 
         The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
         """
+        data = Places({kind: each for kind, each in beside.known.items() if each.cameras}).aligned(data)
         old = set_up_kind(data).among(beside.known, beside.turns)
         if beside.unplaced and not data.remounted:
             data = data.with_sessions([name or ROWS for name in data.device_names])
