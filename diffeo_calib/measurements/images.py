@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -215,8 +216,7 @@ class ImageTable(RowGroups):
             return self
         how = {"seen_by": self.camera_names, "camera_on_tool": self.board is not None, "doubt": False}
         first, again = (
-            self.from_images(self.q, self.corners, cameras, self.joint_names, **how)
-            for cameras in (self.cameras, known)
+            self.from_images(self.q, self.corners, each, self.joint_names, **how) for each in (self.cameras, known)
         )
         moved = self.frames[:, 0] @ torch.linalg.inv(first.frames[:, 0])
         still = torch.eye(4, dtype=moved.dtype, device=moved.device)
@@ -234,7 +234,9 @@ class ImageTable(RowGroups):
             away = torch.cat([cameras[name].unknowns - own.unknowns for name, own in self.cameras.items()])
             errors = torch.linalg.lstsq(roots, away, driver="gelsd").solution
             points = self.points - (shared.slopes @ errors).view_as(self.points)
-            return with_attributes(self, points=points, poses=of_frames(frames_of_points(points, self.lever)))
+            moved = {name: replace(own, unknowns=cameras[name].unknowns) for name, own in self.cameras.items()}
+            columns = {"points": points, "poses": of_frames(frames_of_points(points, self.lever)), "cameras": moved}
+            return with_attributes(self, **columns)
         return self
 
     def on_frames(self, transforms: Tensor) -> Self:

@@ -14,6 +14,7 @@ from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, 
 from simulated_sockets import rest_in_sockets
 from table_bank import refused, warned
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
@@ -63,6 +64,9 @@ def test_a_model_is_compared_with_what_its_own_camera_sees() -> None:
     q, corners = replace(arm(), camera=replace(true_camera(), unknowns=unknowns)).shown(0.1, 11)
     images = of_corners(corners, q, board=BoardPrior(scale=5e-3))
     result = dc.calibrate(arm().arm.nominal, images, hyperparameters=calibrated().selection.scales)
+    cameras = {"camera": result.model.placement[0].cameras["camera"].camera}
+    once = images.seen_with(cameras)
+    assert_close(once.seen_with(cameras).points, once.points, rtol=0, atol=1e-12)
     errors = next(iter(result.errors(images).values()))
     assert errors["calibrated"].rms < errors["geometric"].rms
     assert dc.evaluate(result.model, images).rms == pytest.approx(errors["calibrated"].rms)

@@ -155,6 +155,8 @@ def test_the_gain_is_that_of_the_definition() -> None:
     assert jump.rows == (CHANGE_ROWS + int(np.argmax(gains)),)
     left = (float(r @ inverse @ r) - max(gains)) / len(r)
     assert jump.gain == pytest.approx(max(gains) / max(1.0, left), rel=1e-5)
+    wide, _ = changes([Hypothesis("any", effects)], data.process(setting.scales), order, 3.0 + left)
+    assert wide.gain == pytest.approx(max(gains) / (3.0 + left), rel=1e-5)
 
 
 @pytest.mark.slow
