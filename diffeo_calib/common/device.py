@@ -56,7 +56,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def outside_inference_mode(function: F) -> F:
-    """The same function, run outside of inference mode."""
+    """Return the function, run outside of inference mode."""
 
     @wraps(function)
     def outside(*args: Any, **options: Any) -> Any:
@@ -69,7 +69,7 @@ def outside_inference_mode(function: F) -> F:
 
 
 def methods_outside_inference_mode(cls: type[T]) -> type[T]:
-    """The same class, its constructor, call and public methods run outside of inference mode."""
+    """Return the class, its constructor, call and public methods run outside of inference mode."""
     for name, value in list(vars(cls).items()):
         if isfunction(value) and (not name.startswith("_") or name in ("__init__", "__post_init__", "__call__")):
             setattr(cls, name, outside_inference_mode(value))

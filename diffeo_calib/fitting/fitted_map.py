@@ -98,7 +98,7 @@ class FittedMap:
         return low + (high - low) * draws
 
     def without_rigid_motions(self) -> FittedMap:
-        """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
+        """Return the map whose covariances leave out rigid motions over the joint ranges of its rows."""
         return replace(self, workspace=self.everywhere)
 
     @property
@@ -129,7 +129,7 @@ class FittedMap:
         return single_coordinates(self.functionals)
 
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
-        """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
+        """Return the map around another nominal map with the same parameters, with what it knows of its covariances."""
         other = copy(self)
         other.deformation, other._origin = self.geodesic.with_nominal(nominal), self._origin or self
         return other
@@ -144,7 +144,7 @@ class FittedMap:
         return f"FittedMap({kind}{self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
 
     def to(self, device: torch.device | str) -> FittedMap:
-        """The same map on a device, where its inputs must be too."""
+        """Return the map on a device, where its inputs must be too."""
         device = usable(device)
         if device == self.x.device:
             return self  # with what it has computed for its covariances
@@ -326,7 +326,7 @@ class FittedMap:
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
 
     def inflated(self, factor: float) -> FittedMap:
-        """The same map with all variances multiplied by a factor."""
+        """Return the map with all variances multiplied by a factor."""
         old, spec = self.geodesic, self.geodesic.spec
         kernels = {name: getattr(spec, name).scaled(factor) for name in ("joint_kernel", "task_kernel")}
         b, p, theta = old.momenta.tensors

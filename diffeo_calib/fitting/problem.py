@@ -166,11 +166,11 @@ class Problem:
         return other
 
     def using(self, backend: Backend, accuracy: float | None = None) -> Problem:
-        """The same problem with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
+        """Return the problem with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
         return self._with(spec=self.spec.using(backend, accuracy))
 
     def to(self, device: torch.device | str) -> Problem:
-        """The same problem on a device, where its fits and their models then run."""
+        """Return the problem on a device, where its fits and their models then run."""
         device = usable(device, numbers=False)
         parts = {name: value for name, value in vars(self).items() if hasattr(value, "to")}
         return self._with(**{name: value.to(device) for name, value in parts.items()})
@@ -189,7 +189,7 @@ class Problem:
         return self._with(controls=points, reduced=not torch.equal(points, self.x), whole=whole)
 
     def with_nominal_of_rows(self, nominal: NominalMap) -> Problem:
-        """The same problem with another k0 at its own rows than elsewhere, see :class:`ModelSpec`."""
+        """Return the problem with another k0 at its own rows than elsewhere, see :class:`ModelSpec`."""
         return self if nominal is self.spec.nominal else self._with(spec=replace(self.spec, at_controls=nominal))
 
     def standing_for(self, whole: Problem) -> Problem:
@@ -201,7 +201,7 @@ class Problem:
         return self._with(whole=whole)
 
     def subset(self, rows: Tensor) -> Problem:
-        """The same problem with only the measurements of these row numbers."""
+        """Return the problem with only the measurements of these row numbers."""
         x = self.x[rows]
         observe = None if self.observe is None else self.observe.rows(rows)
         whole = None if self.whole is None else self.whole.subset(rows)

@@ -159,7 +159,7 @@ class Flow:
         self.nodes, self.stages = self._run.nodes, self._run.stages
 
     def using(self, backend: Backend) -> Flow:
-        """The same flow, whose passive points move by kernel sums of this backend."""
+        """Return the flow, whose passive points move by kernel sums of this backend."""
         other = copy(self)
         other.kernel = self.kernel.using(backend)
         return other

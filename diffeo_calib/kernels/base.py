@@ -165,7 +165,7 @@ class Kernel(ABC):
         raise InputError.of(f"{type(self).__name__} cannot be scaled", fix="write its method `scaled(factor)`")
 
     def using(self, backend: Backend, accuracy: float | None = None) -> Kernel:
-        """The same kernel with its sums evaluated by this backend.
+        """Return the kernel with its sums evaluated by this backend.
 
         A kernel of your own always uses the dense matrix, and warns of another backend. If it is radial, make it a
         :class:`~diffeo_calib.kernels.radial.RadialKernel` of a :class:`~diffeo_calib.kernels.profiles.Profile`: it then
@@ -185,7 +185,7 @@ class Kernel(ABC):
         return {"dense"}
 
     def to(self, device: torch.device | str) -> Kernel:
-        """The same kernel with all its tensor attributes on a device."""
+        """Return the kernel with all its tensor attributes on a device."""
         moved = copy(self)
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
@@ -353,7 +353,7 @@ def diagonal_gram(values: Tensor, left: Tensor, right: Tensor) -> Tensor:
 
 
 def component_gram(components: Iterable[tuple[int, Tensor]], left: Tensor, right: Tensor) -> Tensor:
-    """The same by components that are added first, so that no term of a sum needs a large matrix: (M k, N l).
+    """Add components first, so that no term of a sum needs a large matrix: (M k, N l).
 
     Args:
         components: numbers c of components and their values K(x_i, y_j)_cc, (N Q, M).

@@ -88,7 +88,7 @@ class CalibratedKinematics:
         self.ball = ball or map.workspace is not None
 
     def with_tool(self, tool: object, tip: str | None = None) -> CalibratedKinematics:
-        """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m.
+        """Return the model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m.
 
         For a robot with several tips, ``tip`` names the one that carries it, and commands and exports are those of it.
         """
@@ -105,7 +105,7 @@ class CalibratedKinematics:
         return self.nominal.load.mass
 
     def with_payload(self, mass: float) -> CalibratedKinematics:
-        """The same robot with another payload, for queries, compensation and exports.
+        """Return the robot with another payload, for queries, compensation and exports.
 
         A model that was calibrated with payloads carries the median of them until it is told another. For measurements
         with a payload of each row there is :func:`diffeo_calib.evaluate`.
@@ -143,7 +143,7 @@ class CalibratedKinematics:
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None, learn: bool = True
     ) -> CalibratedKinematics:
-        """The same robot seen by a device that has moved, with markers that have moved or other ones.
+        """Return the robot seen by a device that has moved, with markers that have moved or other ones.
 
         From 4 to 10 poses the measuring frame and the markers are found anew, and what the rows say of the robot is
         learnt. Outliers take no part, predictions include what is not known, and of more than 200 rows 200 are used.
@@ -182,7 +182,7 @@ class CalibratedKinematics:
         return self.learnt or self.map.registration
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
-        """The same model on a device, where its joint values must be too."""
+        """Return the model on a device, where its joint values must be too."""
         return self.changed(map=self.map.to(usable(device)))
 
     @property

@@ -91,15 +91,15 @@ class GeometryMap(NominalMap):
         return torch.cat([theta[: self.sag.start], self.elasticity.folded(theta[self.sag]), theta[self.sag.stop :]])
 
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
-        """The same parameters around another geometry of the same chain."""
+        """Return the parameters around another geometry of the same chain."""
         return self.changed(geometry=geometry)
 
     def with_payload(self, load: Payload) -> GeometryMap:
-        """The same map with other masses of its payload."""
+        """Return the map with other masses of its payload."""
         return self if load is self.load else self.changed(payload=load)
 
     def changed(self, **changes: Any) -> GeometryMap:
-        """The same map with other arguments."""
+        """Return the map with other arguments."""
         arguments = {"geometry": self.geometry, "own": self.own, "payload": self.load, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **arguments | changes)
 
@@ -300,7 +300,7 @@ class SessionMarkers(NominalMap):
         return self.nominal.load
 
     def around(self, nominal: GeometryMap) -> SessionMarkers:
-        """The same sessions with the base of another nominal map, and the payloads of their rows."""
+        """Return the sessions with the base of another nominal map, and the payloads of their rows."""
         return SessionMarkers(nominal.with_payload(self.load), self.session, self.tools)
 
     def _by_session(self, of: Callable[[GeometryMap, Tensor], Tensor]) -> Tensor:

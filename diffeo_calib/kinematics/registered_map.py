@@ -154,7 +154,7 @@ class RegisteredMap(FittedMap):
         self.at_registration = self.geodesic
 
     def with_nominal(self, nominal: NominalMap) -> RegisteredMap:
-        """The same map around another nominal map of the fit."""
+        """Return the map around another nominal map of the fit."""
         other = RegisteredMap(self.fitted.with_nominal(nominal), self.registration)
         other.at_registration = self.at_registration
         return other
@@ -165,7 +165,7 @@ class RegisteredMap(FittedMap):
         return self.fitted
 
     def to(self, device: torch.device | str) -> RegisteredMap:
-        """The same map on a device, where its inputs must be too."""
+        """Return the map on a device, where its inputs must be too."""
         return RegisteredMap(self.fitted.to(device), self.registration)
 
     def linearised_value(

@@ -39,7 +39,7 @@ class Momenta:
         return torch.cat([t.flatten() for t in self.tensors])
 
     def to(self, device: torch.device | str) -> Momenta:
-        """The same momenta on a device."""
+        """Return the momenta on a device."""
         return Momenta(*(t.to(device) for t in self.tensors))
 
     def unflatten(self, vector: Tensor) -> Momenta:
@@ -67,12 +67,12 @@ class ModelSpec:
         return self.nominal if self.at_controls is None else self.at_controls
 
     def using(self, backend: Backend, accuracy: float | None = None) -> ModelSpec:
-        """The same model with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
+        """Return the model with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
         joint, task = (kernel.using(backend, accuracy) for kernel in (self.joint_kernel, self.task_kernel))
         return replace(self, joint_kernel=joint, task_kernel=task)
 
     def to(self, device: torch.device | str) -> ModelSpec:
-        """The same model on a device. Nominal maps move their own constants to the device of their input."""
+        """Return the model on a device. Nominal maps move their own constants to the device of their input."""
         joint, task = self.joint_kernel.to(device), self.task_kernel.to(device)
         return replace(self, joint_kernel=joint, task_kernel=task, prior_variance=self.prior_variance.to(device))
 
@@ -128,7 +128,7 @@ class Deformation(ABC):
 
     @abstractmethod
     def to(self, device: torch.device | str) -> Deformation:
-        """The same deformation on a device."""
+        """Return the deformation on a device."""
 
 
 def backend_names(kernel: Kernel, points: Tensor) -> str:

@@ -109,27 +109,27 @@ class GeodesicDeformation(Deformation):
         return GeodesicDeformation(*moved, self.integrator)
 
     def using(self, backend: Backend) -> GeodesicDeformation:
-        """The same deformation, evaluated at given configurations by kernel sums of this backend."""
+        """Return the deformation, evaluated at given configurations by kernel sums of this backend."""
         other = copy(self)
         other.joint_flow, other.task_flow = self.joint_flow.using(backend), self.task_flow.using(backend)
         return other
 
     def with_spec(self, **changes: object) -> GeodesicDeformation:
-        """The same deformation with another nominal map, or other prior variances of theta for covariances."""
+        """Return the deformation with another nominal map, or other prior variances of theta for covariances."""
         other = copy(self)
         vars(other).pop("_slopes", None)
         other.spec = replace(self.spec, **changes)
         return other
 
     def with_nominal(self, nominal: NominalMap) -> GeodesicDeformation:
-        """The same two flows around another nominal map with the same parameters: k1 of other points of the body.
+        """Return the two flows around another nominal map with the same parameters: k1 of other points of the body.
 
         The controls stay those of the fit; evaluate and linearise the result at given configurations only.
         """
         return self.with_spec(nominal=nominal)
 
     def at_rows(self, index: slice) -> GeodesicDeformation:
-        """The same at some of the rows that its nominal map was made for."""
+        """Return the deformation at some of the rows that its nominal map was made for."""
         some = self.spec.nominal.rows(index)
         return self if some is self.spec.nominal else self.with_nominal(some)
 

@@ -203,7 +203,7 @@ class Numbers:
 
     @classmethod
     def of(cls, at: Linearisation, target: Tensor | None = None, shown: Tensor | None = None) -> Numbers:
-        """Those of a table: target (N, R), zero by default, and which are there (N, R), boolean, all by default."""
+        """Numbers of a table: target (N, R), zero by default, and which are there (N, R), boolean, all by default."""
         S = at.sensitivity
         target = S.new_zeros(S.shape[:2]) if target is None else target
         shown = torch.ones_like(target, dtype=torch.bool) if shown is None else shown
@@ -235,7 +235,7 @@ class Numbers:
         return self.there(values.flatten(0, 1))
 
     def there(self, values: Tensor) -> Tensor:
-        """The same of a flattened table: (N R, ...) -> (M, ...)."""
+        """Pick the numbers that are there from a flattened table: (N R, ...) -> (M, ...)."""
         return values if self.all_there else values[self.cells]
 
     def in_table(self, values: Tensor) -> Tensor:
@@ -264,7 +264,7 @@ class Numbers:
         return matrix[place[:, :, None], place[:, None]] * (there[:, :, None] * there[:, None])
 
     def rows(self, index: Tensor) -> Numbers:
-        """Those of some rows."""
+        """Keep some rows."""
         shown = self.in_table(torch.ones_like(self.cells)) > 0
         return Numbers.of(self.at.rows(index), self.in_table(self.target)[index], shown[index])
 

@@ -65,7 +65,7 @@ class Noise:
         self._factor = factor
 
     def to(self, device: torch.device | str) -> Noise:
-        """The same noise on a device."""
+        """Return the noise on a device."""
         moved = copy(self)
         moved.covariance, moved._factor = self.covariance.to(device), self._factor.to(device)
         moved.shared = self.shared.to(device)

@@ -60,7 +60,7 @@ class Observation(ABC):
         return self._with({name: getattr(self, name)[index] for name in self.constants})
 
     def to(self: O, device: torch.device | str) -> O:
-        """The same observation on a device."""
+        """Return the observation on a device."""
         return self._with({name: getattr(self, name).to(device) for name in self.constants})
 
     def _with(self: O, tensors: dict[str, Tensor]) -> O:
@@ -163,7 +163,7 @@ class Part:
         return replace(self, rows=kept, observe=self.observe.rows(numbers[kept])) if len(kept) else None
 
     def to(self, device: torch.device | str) -> Part:
-        """The same part on a device."""
+        """Return the part on a device."""
         rows, points, numbers = (part.to(device) for part in (self.rows, self.points, self.numbers))
         return Part(rows, points, numbers, self.observe.to(device))
 

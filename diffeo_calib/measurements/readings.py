@@ -407,7 +407,7 @@ class SocketReadings(Readings):
         return self.q
 
     def with_sessions(self, names: object, **_: object) -> Self:
-        """The same rows; MeasurementError for several sessions: sockets of another set-up are other sockets."""
+        """Return the rows; MeasurementError for several sessions: sockets of another set-up are other sockets."""
         sessions = () if names is None else checks.numbered(names, len(self))[1]
         if len(sessions) > 1:
             fix = "give the sockets of each session names of their own, and leave the sessions out"

@@ -117,7 +117,7 @@ class RowGroups:
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
-        """The same rows after a change of each part, given with its row numbers (N_i,)."""
+        """Return the rows after a change of each part, given with its row numbers (N_i,)."""
         return change(self, *self.index)
 
     def to_frame(self) -> Any:
@@ -180,7 +180,7 @@ class RowGroups:
         return (self.rows(i) for i in range(len(self)))
 
     def with_columns(self, **columns: object) -> Self:
-        """The same rows with other attributes; tensors (N, ...) have a value for each row."""
+        """Return the rows with other attributes; tensors (N, ...) have a value for each row."""
 
         def changed(part: Any, rows: Tensor) -> Any:
             chosen = {name: v[rows.to(v.device)] if isinstance(v, Tensor) else v for name, v in columns.items()}
@@ -189,7 +189,7 @@ class RowGroups:
         return self.of_each(changed)
 
     def to(self, device: torch.device | str) -> Self:
-        """The same rows with their values on a device."""
+        """Return the rows with their values on a device."""
         place = usable(device)
 
         def moved(part: Any, _: Tensor) -> Any:
@@ -198,11 +198,11 @@ class RowGroups:
         return self.of_each(moved)
 
     def with_joint_names(self, names: Sequence[str]) -> Self:
-        """The same rows with n distinct names of the joints, else MeasurementError."""
+        """Return the rows with n distinct names of the joints, else MeasurementError."""
         return self.with_columns(joint_names=checks.checked_names(names, "names", self.n, "column of `q`"))
 
     def with_payload(self, payload: object, at: str | None = None) -> Self:
-        """The same rows with a payload of known mass, whose sag a calibration then finds.
+        """Return the rows with a payload of known mass, whose sag a calibration then finds.
 
         Args:
             payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
@@ -221,7 +221,7 @@ class RowGroups:
         return self.with_columns(payload=masses.expand(len(self)).clone(), payload_at=at)
 
     def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
-        """The same rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
+        """Return the rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
 
         A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
         the model, which then holds for the middle of each column's range.
@@ -235,11 +235,11 @@ class RowGroups:
         return self.with_columns(covariates=torch.stack(parts, 1) if parts else None, covariate_names=tuple(given))
 
     def with_load(self, load: Payload) -> Self:
-        """The same rows with the masses of a payload, if there is one."""
+        """Return the rows with the masses of a payload, if there is one."""
         return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
-        """The same rows with line numbers (N,), which tell where every row comes from, else MeasurementError."""
+        """Return the rows with line numbers (N,), which tell where every row comes from, else MeasurementError."""
         lines = checks.copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
         return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
 

@@ -150,7 +150,7 @@ class TableFormat:
         return UNITS_PER_METRE[self.joint_unit]
 
     def joints_only(self) -> TableFormat:
-        """The same units, marks, joints and columns beside them, without what was measured."""
+        """Return the units, marks, joints and columns beside them, without what was measured."""
         kept = "length", "angle", "sep", "decimal", "joint_length", "joints", "kinds", *BESIDE
         return TableFormat(**{name: getattr(self, name) for name in kept})
 
@@ -162,7 +162,7 @@ class TableFormat:
         return list(by_frame("position", self.position, "three names of columns for each marker", 3))
 
     def for_reading(self) -> TableFormat:
-        """The same format with checked options of the rotation.
+        """Return the format with checked options of the rotation.
 
         Raises:
             MeasurementError: a convention or unit that is missing, unknown or not needed, or a wrong number of names.
@@ -193,7 +193,7 @@ class TableFormat:
         return replace(self, rotation=rotation, rotation_std=std)
 
     def for_writing(self, *, rotation_std: bool, prefixes: Sequence[str] = ("",)) -> TableFormat:
-        """The same format with defaults for the columns, the convention and the unit of rotations that are written.
+        """Return the format with defaults for the columns, the convention and the unit of rotations that are written.
 
         ``rotation_std``: whether their standard deviations are written, too. ``prefixes``: what the default names of
         the columns of each frame begin with. MeasurementError for an unknown convention, unit or number of names.

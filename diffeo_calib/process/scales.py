@@ -141,7 +141,7 @@ class Hyperparameters:
         return deviations.square()
 
     def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
-        """The same scales, with amplitudes set to zero where the field stays far below the noise.
+        """Return the scales, with amplitudes set to zero where the field stays far below the noise.
 
         Args:
             jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2, or their mean (m, m).

@@ -222,12 +222,12 @@ class Process(Conditional):
         )
 
     def opened(self, E: Tensor, size: float | None = None) -> Process:
-        """The same rows beside unknowns of this deviation, of any by default, with effects (M, U) on them alone."""
+        """Return the rows beside unknowns of this deviation, of any by default, with effects (M, U) on them alone."""
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
     def with_effects(self, unknowns: Tensor, E: Tensor) -> Process:
-        """The same rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
+        """Rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
         return replace(self, factor=self.factor.with_features(unknowns, E))
 
     def features(self, at: Linearisation, sooner: Features | None = None, cross: Tensor | None = None) -> Features:
@@ -306,7 +306,7 @@ class Process(Conditional):
         return variance.sqrt() * shift[: len(variance), 0]
 
     def about(self, target: Tensor) -> Process:
-        """The same rows with another target (N, R)."""
+        """Return the rows with another target (N, R)."""
         target = self.numbers.of_table(target)
         alpha = self.factor.white(target[:, None])[:, 0]
         return replace(self, numbers=replace(self.numbers, target=target), alpha=alpha)
@@ -328,7 +328,7 @@ class Process(Conditional):
         return errors, covariance
 
     def rows_left_out(self, group: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The same by row, errors (N, R) and covariances (N, R, R); group: (N,), by default each by itself."""
+        """Left-out errors (N, R) and covariances (N, R, R) by row; group: (N,), by default each by itself."""
         owner = self.numbers.owner
         errors, covariance = self.left_out(owner if group is None else group[owner])
         return self.numbers.in_table(errors), self.numbers.blocks(covariance)

@@ -147,7 +147,7 @@ class Geometry:
         return torch.cat([by_twist, by_tool], dim=-1)
 
     def with_tool(self, tool: Tensor, on: tuple[str, ...] = ()) -> Geometry:
-        """The same robot with other markers (P, 3) on these tips; as many markers as before stay on theirs."""
+        """Return the robot with other markers (P, 3) on these tips; as many markers as before stay on theirs."""
         kept = self.on if len(tool) == self.markers else ()
         return replace(self, tool=tool, on=on or kept)
 

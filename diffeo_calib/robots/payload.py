@@ -90,7 +90,7 @@ class Payload:
         return float(self.masses.median()) if self else None
 
     def under(self, masses: Tensor | None) -> Payload:
-        """The same place with the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
+        """Return the place with the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
         if not self:
             what, fix = (
                 "the measurements have payloads, the model was calibrated without",
@@ -104,7 +104,7 @@ class Payload:
         return self.weighing(masses)
 
     def checked(self) -> Payload:
-        """The same payload; InputError for masses far above those of the fit, a warning for masses above them."""
+        """Return the payload; InputError for masses far above those of the fit, a warning for masses above them."""
         largest = float(self.masses.max()) if self.masses.numel() else 0.0
         got, measured = f"{largest:g}", f"0 to {self.unit:g} in the measurements of the fit"
         if largest > ABSURD * self.unit:
@@ -148,7 +148,7 @@ def words_of_mass(mass: float | None) -> str:
 
 
 def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> Tree:
-    """The same robot with a weight beside the links of its description, for the place of a payload.
+    """Return the robot with a weight beside the links of its description, for the place of a payload.
 
     It is a branch without markers whose weight bends the robot, as `load` of :func:`load_urdf`: exports that know
     serial robots only refuse it.

@@ -146,7 +146,7 @@ class SimulatedArm:
         return q, points + self.noise * torch.from_numpy(draw)
 
     def worn(self, joint: int, factor: float) -> SimulatedArm:
-        """The same arm after the transmission error of one joint has grown by a factor.
+        """Return the arm after the transmission error of one joint has grown by a factor.
 
         Args:
             joint: its number. factor: of the amplitudes of all its harmonics.

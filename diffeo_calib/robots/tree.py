@@ -119,7 +119,7 @@ class Tree:
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
     def reversed(self, tip: str | None = None) -> Tree:
-        """The same robot with one of its tips as base; gravity still acts as on the ground.
+        """Return the robot with one of its tips as base; gravity still acts as on the ground.
 
         The old base is the new tip; of several tips the other ones stay (hand to hand). ``joint_names`` are reordered.
 

@@ -36,7 +36,7 @@ class Program:
     tip: int = 0  # number of the tip that carries other points
 
     def at(self, tip: str) -> Program:
-        """The same program for points on another tip."""
+        """Return the program for points on another tip."""
         return replace(self, tip=self.chain.nominal.tips.index(tip))
 
     def points(self, q: Array, points: Array | None = None) -> Array:

@@ -100,7 +100,7 @@ class BoardCameras(Extrinsics):
         return cls((), none, none, rows, device)
 
     def with_cameras(self, cameras: Mapping[str, BoardCamera]) -> BoardCameras:
-        """The same rows of cameras by their names."""
+        """Return the rows of cameras by their names."""
         numbers = torch.stack([device.numbers for device in cameras.values()])
         deviations = torch.stack([device.camera.deviations for device in cameras.values()])
         return replace(self, names=tuple(cameras), constants=numbers, deviations=deviations)

@@ -173,7 +173,7 @@ class Positions(Sensor):
     fix = "name the columns of the rotation too"
 
     def check(self, data: Measurements, model: Any) -> None:
-        """The same kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
+        """Return the kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
         fitted, bodies = model.bodies, data.bodies
         if fitted.kind != bodies.kind:
             what = f"the model was calibrated with {fitted.kind}"

@@ -39,7 +39,7 @@ class SampledRows(NamedTuple):
 
     @classmethod
     def of(cls, data: TangentData, scales: Hyperparameters) -> tuple[SampledRows, TangentData]:
-        """Those of a calibration with these scales, and their measurements."""
+        """Sample the rows of a calibration with these scales: what is known by them, and their measurements."""
         index, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
         return cls(index, some.process(scales), some.basis), some
 

@@ -73,7 +73,7 @@ def check_joints(robot: Tree, data: Any) -> None:
 def check_limits(robot: Tree, data: Any) -> None:
     """Warn of joints far beyond the robot's limits, but for whole turns.
 
-    likely_mistakes.Reading the data warns of joints that span several turns.
+    Reading the data warns of joints that span several turns.
     """
     low, high = robot.limits.to(data.q.device).unbind(1)
     turns = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)

@@ -150,7 +150,7 @@ class Scene:
 
 
 def followed(targets: Tensor, coordinates: int) -> Tensor:
-    """Those of configurations (T, n), of so many coordinates each, that are followed."""
+    """Choose the configurations of (T, n), of so many coordinates each, that are followed."""
     most = max(2, TARGET_COORDINATES // coordinates)
     if len(targets) <= most:
         return targets

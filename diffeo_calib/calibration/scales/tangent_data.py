@@ -263,7 +263,7 @@ class TangentData:
         return self.noise_model.weighted(self.noise(scales), self.tails)
 
     def noise_of_numbers(self, scales: Hyperparameters) -> Tensor:
-        """The same of what rows tell: (N, r, r), m^2."""
+        """Noise of the numbers that rows tell: (N, r, r), m^2."""
         return self.blocks_in_numbers(self.weighted_noise(scales))
 
     def noise_of_any_row(self, scales: Hyperparameters) -> Tensor:

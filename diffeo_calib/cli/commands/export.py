@@ -55,7 +55,7 @@ FIELD = (
 )
 TOGETHER = "they are for use together with the correction tables: write files that are used alone without these"
 HASH = re.compile(r"^ *hash: *((?!diffeo_calib_)[A-Za-z]\w*)", re.ASCII | re.MULTILINE)
-"""That of a robot, rather than of a file that was written before."""
+"""The hash of a robot, not of a file that was written before."""
 UR_HASH = (
     "the UR driver compares the entry hash with the controller's and will report another calibration: "
     "write --ur-kinematics over a copy of the robot's own calibration file, whose hash it keeps"
