@@ -227,14 +227,14 @@ class ImageTable(RowGroups):
 
     def seen_with(self, cameras: Mapping[str, Camera]) -> Self:
         """The points by lenses and boards of other cameras, to first order and row by row, unless these differ."""
-        if any(name not in cameras or not own.alike(cameras[name]) for name, own in self.cameras.items()):
+        if any(name not in cameras or not camera.alike(cameras[name]) for name, camera in self.cameras.items()):
             return self
         for shared in self.shared_errors():
-            roots = torch.cat([own.root for own in self.cameras.values()])
-            away = torch.cat([cameras[name].unknowns - own.unknowns for name, own in self.cameras.items()])
+            roots = torch.cat([camera.root for camera in self.cameras.values()])
+            away = torch.cat([cameras[name].unknowns - camera.unknowns for name, camera in self.cameras.items()])
             errors = torch.linalg.lstsq(roots, away, driver="gelsd").solution
             points = self.points - (shared.slopes @ errors).view_as(self.points)
-            moved = {name: replace(own, unknowns=cameras[name].unknowns) for name, own in self.cameras.items()}
+            moved = {name: replace(camera, unknowns=cameras[name].unknowns) for name, camera in self.cameras.items()}
             columns = {"points": points, "poses": of_frames(frames_of_points(points, self.lever)), "cameras": moved}
             return with_attributes(self, **columns)
         return self

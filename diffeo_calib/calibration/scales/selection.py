@@ -49,9 +49,10 @@ LENGTH, GROWTH, SHRINKAGE = 1.0, 1.0, 2.0
 """Log-normal prior of the scales around their defaults, standard deviations in e-folds: of length scales and noise, of
 amplitudes above their defaults, and of those below."""
 AXES = 0.3
-"""Standard deviation of each axis of commanded poses or places around the mean of the slides, or of the turns. The axes of such a
-frame are a choice: fields look alike along all of them unless the rows say otherwise. Scales that were free for each
-axis would fit 20 poses too well, and the regions of a hand-eye transform would hold 0.90 for 0.95."""
+"""Standard deviation of each axis of commanded poses or places around the mean of the slides, or of the turns.
+The axes of such a frame are a choice: fields look alike along all of them unless the rows say otherwise. Scales
+that were free for each axis would fit 20 poses too well, and the regions of a hand-eye transform would hold 0.90
+for 0.95."""
 SHORT = 0.3  # of the default length scales and noise
 
 
