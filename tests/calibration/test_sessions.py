@@ -85,6 +85,6 @@ def test_rows_of_several_set_ups_are_not_compared_with_a_model(arm: SimulatedArm
             lambda: dc.calibrate(arm.nominal, whole.with_sessions(["a"] * (ROWS - 3) + ["b"] * 3)),
         ),
         (r"the names of sessions: expected 6 names", lambda: data.with_sessions(["a", "b"])),
-        (r"the names of sessions: .* cannot be listed", lambda: data.with_sessions(torch.zeros(6, device="meta"))),
+        (r"the names of sessions: expected 6 names", lambda: data.with_sessions(torch.zeros(6, device="meta"))),
         (r"the names of sessions: 1 row\(s\)", lambda: data.with_sessions(["a", " ", "b", "b", "a", "a"])),
     )
