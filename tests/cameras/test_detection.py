@@ -43,9 +43,6 @@ def image(number: int = 0, blur_px: float = 0.6) -> np.ndarray:
     return rendered(boards(8, seed=4)[number], texture(), blur_px=blur_px, seed=number)
 
 
-# --- corners --------------------------------------------------------------------------------------------------------
-
-
 def test_corners_are_found_to_hundredths_of_a_pixel() -> None:
     numbers, pixels = FOUND.corners(image())
     errors = pixels - CAMERA.pixels(boards(8, seed=4)[:1], torch.from_numpy(FOUND.points[numbers])[None])[0].numpy()
@@ -149,9 +146,6 @@ def test_a_wide_lens_is_no_other_layout() -> None:
         Board.of(GRID.format("4x3", ":0:right-up")).corners(bent)
 
 
-# --- reasons --------------------------------------------------------------------------------------------------------
-
-
 ALONG = np.zeros((7, 7), np.float32)
 ALONG[3] = 1 / 7
 REASONS = {
@@ -167,9 +161,6 @@ REASONS = {
 def test_refused_images_are_named(reason: str) -> None:
     with pytest.raises(InputError, match=reason):
         FOUND.corners(REASONS[reason](image()))
-
-
-# --- folders --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

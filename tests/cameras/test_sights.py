@@ -34,9 +34,6 @@ def pose_errors(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return torch.cat([(found - truth)[:, :3, 3], torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)], 1)
 
 
-# --- formulas -------------------------------------------------------------------------------------------------------
-
-
 def test_derivatives_of_pixels() -> None:
     lens = CAMERA.lens
     points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -55,16 +52,12 @@ def test_opencv_projects_alike() -> None:
     assert_close(project(points, CAMERA.lens), torch.from_numpy(pixels[:, 0]), rtol=0, atol=1e-9)
 
 
-def test_a_board_is_printed_as_its_formula_says() -> None:
-    """Scales along x and y, and deflections per half of its larger side."""
+def test_the_formula_of_a_board_and_what_a_camera_sees() -> None:
+    """Boards as those of its images were: not from farther away, from behind, nor outside of the image."""
     point, board = FOUND.poses.new_tensor([0.03, 0.02, 0.0]), FOUND.poses.new_tensor([1e-3, 2e-3, 0.01, 0.02, 0.03])
     bent = 0.1 * (0.01 * 0.3**2 + 0.02 * 0.3 * 0.2 + 0.03 * 0.2**2)
     expected = torch.tensor([1.003 * 0.03, 0.999 * 0.02, bent], dtype=torch.float64)
     assert_close(real_board(point, board, 0.1), expected, rtol=1e-12, atol=1e-15)
-
-
-def test_a_camera_sees_boards_as_those_of_its_images_were() -> None:
-    """Not from farther away, from behind, nor outside of the image; how flat they were is the smallest cosine."""
     camera, poses = FOUND.camera, FOUND.poses
     assert camera.view is not None
     assert bool(sees(camera, poses).all())
@@ -76,9 +69,6 @@ def test_a_camera_sees_boards_as_those_of_its_images_were() -> None:
     behind = rotation(torch.tensor([[torch.pi, 0.0, 0.0]], dtype=torch.float64)) @ poses[:, :3, :3]
     for R, place in ((poses[:, :3, :3], 2.0 * middle), (behind, middle), (poses[:, :3, :3], middle + away.max())):
         assert not bool(sees(camera, transforms(R, place - R @ camera.corners.mean(0))).any())
-
-
-# --- the estimate ---------------------------------------------------------------------------------------------------
 
 
 def test_truth_is_found_within_its_deviations() -> None:
@@ -145,29 +135,26 @@ def test_opencv_finds_the_same_lens() -> None:
     pixels = [IMAGES.pixels[k, own].float().numpy() for k, own in enumerate(seen)]
     size = (IMAGES.width, IMAGES.height)
     _, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, size, None, None)
-    theirs = torch.tensor(
-        [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:5].tolist()], dtype=torch.float64
-    )
+    theirs = torch.tensor([*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *distortion.ravel()[:5]], dtype=torch.float64)
     away = (exact.camera.lens - theirs) / exact.camera.deviations[: len(LENS)]
     assert float(away.abs().max()) < 0.7
 
 
-def test_wrong_corners_hardly_count() -> None:
+def test_wrong_corners_a_longer_focal_length_and_sentences() -> None:
+    """Wrong corners hardly count; a longer focal length is an error of the lens alone."""
     pixels = IMAGES.pixels.clone()
     pixels[::3, 5] += 30.0
     away = (sighted(replace(IMAGES, pixels=pixels)).camera.unknowns - CAMERA.unknowns) / FOUND.camera.deviations
     assert float(away.abs().max()) < 5.0
-
-
-def test_a_longer_focal_length_is_an_error_of_the_lens_alone() -> None:
     whole = FOUND.camera.root
     assert_close(whole @ FOUND.camera.longer, FOUND.camera.unknowns * (torch.arange(len(whole)) < 2))
     board = torch.randn(5, 5, dtype=whole.dtype, generator=seeded(0))
     exact = replace(FOUND.camera, root=torch.cat([torch.zeros_like(whole[: len(LENS), :5]), board]))
     assert not bool(exact.longer.any())  # and not what rounding makes of it
-
-
-# --- files ----------------------------------------------------------------------------------------------------------
+    text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
+    assert all(name in text for name in LENS)
+    assert "lengths in the images are the board's" in text
+    assert set(UNKNOWNS) < set(FOUND.camera.entry())
 
 
 def test_files_keep_a_camera(tmp_path: Path) -> None:
@@ -275,9 +262,6 @@ def test_other_and_damaged_files_are_refused(form: str, tmp_path: Path) -> None:
         read_camera(path)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------
-
-
 def test_corners_that_tell_no_pose_are_refused() -> None:
     pixels, points = IMAGES.pixels.clone(), IMAGES.points.clone()
     pixels[3, 4:] = torch.nan
@@ -291,10 +275,3 @@ def test_corners_that_tell_no_pose_are_refused() -> None:
     ):
         with pytest.raises(MeasurementError, match=message):
             sighted(wrong)
-
-
-def test_sentences_name_everything() -> None:
-    text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
-    assert all(name in text for name in LENS)
-    assert "lengths in the images are the board's" in text
-    assert set(UNKNOWNS) < set(FOUND.camera.entry())

@@ -45,9 +45,6 @@ def from_the_tool(path: Path, commanded: Tensor, convention: str = "xyz", angle:
     return poses_table(path, commanded, seen(commanded, camera_on_tool=True), convention, angle)
 
 
-# --- what `init` finds ---
-
-
 def places(rows: int = 20, axes: int = 3, size: float = 1.0) -> Tensor:
     return size * torch.rand(rows, axes, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -229,14 +226,8 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     bodies = [["u", "v", "0"], ["x", "y", "0"]]
     points = dc.read_measurements(table, np.array(["q"]), bodies, length="m", angle="deg").points
     hidden = [-1] * 3
-    assert points.nan_to_num(-1.0).flatten(1).tolist() == [
-        [0.2, 0.3, 0, 0.4, 0.5, 0],
-        [*hidden, 0.6, 0.7, 0],
-        [0.4, 0.5, 0, *hidden],
-    ]
-
-
-# --- hand-eye ---
+    expected = [[0.2, 0.3, 0, 0.4, 0.5, 0], [*hidden, 0.6, 0.7, 0], [0.4, 0.5, 0, *hidden]]
+    assert points.nan_to_num(-1.0).flatten(1).tolist() == expected
 
 
 def check_hand_eye(path: Path, **truths: Tensor) -> None:
@@ -267,9 +258,8 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     done = command("predict", model, table, "-o", tmp_path / "p.csv")
     assert "the poses are those of the camera on the tool, in the frame of the board that stands" in done.out
     assert command("plan", model, "-n", "20", "--range", "X=450:600", "-o", tmp_path / "n.csv").code == 0
-    new = torch.tensor(
-        [[float(cell) for cell in row[:6]] for row in cells(tmp_path / "n.csv")[1:]], dtype=torch.float64
-    )
+    poses = cells(tmp_path / "n.csv")
+    new = torch.tensor([[float(cell) for cell in row[:6]] for row in poses[1:]], dtype=torch.float64)
     assert bool(((new[:, 0] >= 450) & (new[:, 0] <= 600)).all())
     went = transforms(rotation_matrices(new[:, 3:], "xyz", angle="deg"), 1e-3 * new[:, :3])
     there = (torch.linalg.inv(went @ CAMERA) @ BOARD)[:, :3, 3]
@@ -279,7 +269,7 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
     for one, other in zip(before, after, strict=True):
         assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
-    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+    assert poses[0] == [*header[:6], "rank"]
     written = []  # a tool is a rotation vector whatever the poses are, and commands by default as the poses
     for convention, options in (("xyz", []), ("rotvec", ["--convention", "rotvec", "--rotation-angle", "deg"])):
         tool = ["--tool", "0,0,100,20,30,40", *options]
@@ -334,9 +324,6 @@ def test_poses_that_are_refused(pose: str, options: list[str], message: str, com
     done = command("fit", table, *given, "-o", tmp_path / "m")
     assert done.code == 1
     assert message in done.err
-
-
-# --- machines that err ---
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ import diffeo_calib as dc
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
+EULER = ["--rotation", "rx,ry,rz", "--convention", "ZYX", "--rotation-angle", "deg"]
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in deg
 Rows = list[dict[str, str]]
@@ -98,17 +99,8 @@ def test_a_program_of_commands(model: dc.CalibratedKinematics, program: Path, co
     assert f"{float((new - old)[:, 0].abs().max().rad2deg()):.4f}" in done.out
 
 
-@pytest.mark.parametrize(
-    ("frame", "options"),
-    [
-        ("base", []),
-        ("measuring", []),
-        ("base", ["--rotation", "rx,ry,rz", "--convention", "ZYX", "--rotation-angle", "deg"]),
-    ],
-)
-def test_a_program_of_targets(
-    frame: str, options: list[str], model: dc.CalibratedKinematics, program: Path, command: Command
-) -> None:
+@pytest.mark.parametrize(("frame", "options"), [("base", []), ("measuring", []), ("base", EULER)])
+def test_targets(frame: str, options: list[str], model: Any, program: Path, command: Command) -> None:
     """The poses that one run commands are targets of the next, in both frames and in another convention."""
     path, output, names = program.with_name("model.safetensors"), program.with_name("c.csv"), model.robot.joint_names
     assert command("correct", path, program, *UNITS, "-o", output).code == 0

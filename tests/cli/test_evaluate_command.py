@@ -70,9 +70,7 @@ def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, comman
         (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
     ],
 )
-def test_errors_that_no_robot_has_are_exit_1(
-    options: list[str], words: str, site: Site, path: Path, command: Command
-) -> None:
+def test_errors_that_no_robot_has(options: list[str], words: str, site: Site, path: Path, command: Command) -> None:
     """A wrong unit, a left-handed frame: no table, and one sentence that names the mistake."""
     done = command("evaluate", path, site.csv, *(TABLE[2:] if "--position" in options else TABLE), *options)
     assert done.code == 1
@@ -80,8 +78,8 @@ def test_errors_that_no_robot_has_are_exit_1(
     assert words in done.error
 
 
-def test_rows_that_repeat_those_of_the_fit_are_said(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """A copy of rows of the fit with fewer digits, but not rows of other poses; and copies among the new rows."""
+def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
+    """Copies with fewer digits, and among the new rows; one wrong row and a block with its cause, exit code 0."""
     (train, test), copies = site.data.split(0.7, seed=0), site.data[[0, 1, 1]]
     q, points = site.data.q.round(decimals=4), site.data.points
     for one, own, count in ((q, points, len(train)), (test.q, test.points, 0)):
@@ -89,10 +87,6 @@ def test_rows_that_repeat_those_of_the_fit_are_said(site: Site, path: Path, comm
         assert (f"{count} of 40 rows repeat joint values of the fit" in " ".join(done.out.split())) == bool(count)
     done = command("evaluate", path, written(site, tmp_path / "t.csv", copies.q, copies.points), *TABLE)
     assert "1 of 3 rows repeat an earlier row exactly: first row 4, of row 3" in done.warnings[0]
-
-
-def test_wrong_rows_are_named(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """One alone, and a block with its cause; the exit code is 0, since most rows are right."""
     points = site.data.points.clone()
     points[3] += 0.05
     points[30:] += torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
@@ -128,9 +122,7 @@ def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command
         (["--convention", "XYZ"], ["euler1", "euler2", "euler3"]),
     ],
 )
-def test_predicted_poses_are_measurements_of_other_commands(
-    options: list[str], columns: list[str], command: Command, tmp_path: Path
-) -> None:
+def test_predicted_poses(options: list[str], columns: list[str], command: Command, tmp_path: Path) -> None:
     kind, path = kind_named("poses"), tmp_path / "p.csv"
     done = command("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path)
     assert (done.code, done.err.strip()) == (0, "")
@@ -185,9 +177,7 @@ def test_what_moved_is_named(marker: float, site: Site, path: Path, command: Com
     assert float(found[2]) > 99.0
 
 
-def test_the_registered_model(
-    site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
+def test_registered(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     new, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
     done = command("evaluate", path, new, *TABLE, "--free", "both", "-o", output)
     assert (done.code, done.err.strip()) == (0, "")

@@ -88,11 +88,9 @@ def test_all_files_of_one_command(arm: Case, path: Path, command: Command, tmp_p
         ("--urdf a.urdf --ur-kinematics ur.yaml", "expected shoulder_pan_joint, shoulder_lift_joint"),
     ],
 )
-def test_options_that_do_not_belong_together(
-    words: str, message: str, path: Path, command: Command, tmp_path: Path, *, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_options(words: str, message: str, path: Path, command: Command, tmp_path: Path) -> None:
     """Nothing is written where one file cannot be made."""
-    monkeypatch.chdir(tmp_path)
+    command.monkeypatch.chdir(tmp_path)
     done = command("export", path, *words.split())
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())

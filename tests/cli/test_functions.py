@@ -42,9 +42,7 @@ MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
         *((f"def f(q): return q{how}", "of a row: expected always the same") for how in (" - q.mean(0)", ".cumsum(0)")),
     ],
 )
-def test_functions_that_are_none(
-    text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refused_functions(text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     joints._names.cache_clear()
     if text is not None:
@@ -77,9 +75,7 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
         joints._names.cache_clear()
         Path("my_delta.py").write_text(text.replace("300 *", written), encoding="utf-8")
         done = command("evaluate", model, "delta.csv", *pose, *options)
-        assert re.search(
-            "py:kinematics: expected the function that the model was fitted with, got .*" + away, done.error
-        )
+        assert re.search("py:kinematics: expected the function that the model was fitted with, .*" + away, done.error)
     Path("metres.py").write_text(f"{text.replace('return elbows', 'return 1e-3 * (elbows')})", encoding="utf-8")
     done = command("fit", "delta.csv", *pose[:1], pose[1].replace("my_delta", "metres"), *MEASURED, "-o", "w")
     assert "1000 times too large: check their unit (--length), and that of the commanded ones" in done.error

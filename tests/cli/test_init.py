@@ -112,9 +112,7 @@ def write_dh_arm(folder: Path, convention: str, scale: float, joints: str) -> tu
 
 
 @pytest.mark.parametrize("convention", ["craig", pytest.param("standard", marks=pytest.mark.slow)])
-def test_the_convention_that_explains_the_rows(
-    convention: str, tmp_path: Path, command: Command, proposed: Proposed
-) -> None:
+def test_the_convention_of_a_table(convention: str, tmp_path: Path, command: Command, proposed: Proposed) -> None:
     scale = 1e3 if convention == "craig" else 1.0
     q, points = write_dh_arm(tmp_path, convention, scale, "J{}")
     columns = [f"J{k}" for k in range(1, 7)]
@@ -161,16 +159,13 @@ def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -
 def test_places_as_a_distance_and_angles(names: tuple[str, str], written: str, proposed: Proposed) -> None:
     """Only the robot tells in which direction the angles count, and, without names of units, in which unit."""
     q, points = rows()
-    found, _ = proposed(
-        (SERIES, q), (["Slope dist", *names], to_spherical(points, written) * torch.tensor([1.0, GON, GON]))
-    )
+    seen = to_spherical(points, written) * torch.tensor([1.0, GON, GON])
+    found, _ = proposed((SERIES, q), (["Slope dist", *names], seen))
     assert found["position"] == [f"{written}=Slope dist,{names[0]},{names[1]}"]
     assert (found["length"], found["angle"]) == ("mm", "deg")
 
 
-def test_axes_that_stand_still_and_joint_values_in_the_first_line_of_a_pose(
-    tmp_path: Path, proposed: Proposed, init: Proposed
-) -> None:
+def test_axes_that_stand_still_and_lines_without_joints(tmp_path: Path, proposed: Proposed, init: Proposed) -> None:
     q, points = rows()
     found, _ = proposed((SERIES, q), (["j7", "j8"], torch.zeros(ROWS, 2)), (XYZ, points))
     assert found["joints"] == ",".join(SERIES)
@@ -244,9 +239,7 @@ def lift(folder: Path, travel: float = 1.2) -> tuple[Tensor, Tensor]:
         ((1.0, 180 / math.pi, 1e3), {"length": "mm", "angle": "deg", "joint-length": "m"}),
     ],
 )
-def test_units(
-    factors: tuple[float, float, float], written: dict[str, str], tmp_path: Path, proposed: Proposed
-) -> None:
+def test_units(factors: tuple[float, ...], written: dict[str, str], tmp_path: Path, proposed: Proposed) -> None:
     slide, angle, length = factors
     q, points = lift(tmp_path)
     cells = torch.cat([q[:, :1] * slide, q[:, 1:] * angle], 1)
@@ -313,9 +306,7 @@ def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, com
     ("count", "per_degree", "message"),
     [(ROWS, 1.0, "one clear reading"), (3, 1.0, "3 row(s)"), (ROWS, 90.0, "pulses or ticks of encoders; write joints")],
 )
-def test_a_robot_that_explains_nothing_is_refused(
-    count: int, per_degree: float, message: str, tmp_path: Path, proposed: Proposed
-) -> None:
+def test_no_robot_that_fits(count: int, per_degree: float, message: str, tmp_path: Path, proposed: Proposed) -> None:
     points = 1e3 * SimulatedArm(seed=4).measure(count, seed=9)[1][:, 0]
     entries, text = proposed((NAMES, per_degree * rows()[0][:count]), (XYZ, points))
     assert message in text

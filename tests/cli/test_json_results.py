@@ -33,16 +33,14 @@ def test_the_schema_is_one_and_knows_what_commands_add() -> None:
     assert {"rows", "files", "parts"} <= added <= set(RESULTS)
 
 
-def test_an_error_is_written_too(folder: Path, command: Command) -> None:
+def test_errors_and_places_that_are_taken(folder: Path, command: Command) -> None:
+    """An error is written too, but not over other files."""
     words = "evaluate", "none.safetensors", folder / "new.csv", *UNITS, "--json", folder / "out.json"
     assert command(*words).code == 1
     written = json.loads((folder / "out.json").read_text(encoding="utf-8"))
     VALIDATOR.validate(written)
     assert (written["exit_code"], written["results"], written["arguments"][0]) == (1, {}, "evaluate")
     assert "none.safetensors" in written["error"]
-
-
-def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> None:
     model, predicted = folder / "arm.safetensors", folder / "p.csv"
     before = model.read_bytes()
     for place, words in ((model, "--json"), (predicted, "--json"), (folder / "none" / "x.json", "make its folder")):
@@ -62,11 +60,9 @@ def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> Non
         "fit c.toml",
     ],
 )
-def test_an_earlier_result_is_not_mistaken_for_this_one(
-    words: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_earlier_result_is_removed(words: str, folder: Path, command: Command) -> None:
     """The command ends before it could begin: nothing is left, whatever the exit code is looked at."""
-    monkeypatch.chdir(folder)
+    command.monkeypatch.chdir(folder)
     (folder / "out.json").write_text('{"format": "diffeo_calib result", "exit_code": 0}', encoding="utf-8")
     (folder / "c.toml").write_text('csv = "new.csv"\njson = "out.json"\nlength = "furlong"\n', encoding="utf-8")
     assert command(*words.split()).code in (1, 2)

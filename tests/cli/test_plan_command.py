@@ -45,9 +45,7 @@ def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> 
     assert "perhaps far off: measure the first 20 poses" in done.out
 
 
-def test_next_poses_and_poses_to_measure_again(
-    site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
+def test_poses_to_measure_again(site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     first, again = tmp_path / "next.csv", tmp_path / "again.csv"
     file = site.folder / "model.safetensors"
     done = command("plan", file, "-n", 6, "-o", first, *UNITS, "--candidates", site.csv)
@@ -84,12 +82,10 @@ def test_next_poses_and_poses_to_measure_again(
         (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
     ],
 )
-def test_mistakes_are_one_sentence(
-    small_site: Site, sound_path: Path, command: Command, tmp_path: Path, options: list[str], *, message: str
-) -> None:
+def test_mistakes(options: list[str], message: str, small_site: Site, sound_path: Path, command: Command) -> None:
     words = {"MODEL": [sound_path], "ROBOT": small_site.robot(), "CSV": [small_site.csv]}
     arguments = [word for option in options for word in words.get(option, [option])]
-    done = command("plan", "-n", 3, "-o", tmp_path / "poses.csv", *UNITS, *arguments)
+    done = command("plan", "-n", 3, "-o", small_site.folder / "poses.csv", *UNITS, *arguments)
     assert done.code == 1
     assert message in done.error
-    assert not (tmp_path / "poses.csv").exists()
+    assert not (small_site.folder / "poses.csv").exists()

@@ -94,10 +94,8 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
     ],
 )
-def test_refused_rows(
-    options: list[str], message: str, sockets: Path, wires: Path, command: Command, *, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(wires if "--reading" in options else sockets)
+def test_refused_rows(options: list[str], message: str, sockets: Path, wires: Path, command: Command) -> None:
+    command.monkeypatch.chdir(wires if "--reading" in options else sockets)
     done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())

@@ -24,21 +24,16 @@ FIT = (
 )
 
 
-def test_columns_and_units_of_the_fit() -> None:
+def test_columns_and_units_of_the_fit_unless_typed() -> None:
+    """Units are never guessed."""
     units = Rows(length="mm", angle="deg", sep=";")
     rows = replace(units, position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
     assert as_at_the_fit(FIT, Rows()) == rows
     assert as_at_the_fit(FIT, Units()) == Units(length="mm", angle="deg", sep=";")
-
-
-def test_typed_options_win() -> None:
     rows = as_at_the_fit(FIT, Rows(session="night", angle="rad"))
     assert (rows.session, rows.std, rows.angle, rows.length) == ("night", "s", "rad", "mm")
     whole = Rows(position=["x,y,z"], length="m", angle="rad")
     assert as_at_the_fit(FIT, whole) == whole, "what states both units describes the whole format"
-
-
-def test_units_are_never_guessed() -> None:
     for command, missing in (("", "--length and --angle missing"), ("diffeo-calib fit --length m", "--angle missing")):
         with pytest.raises(InputError, match=missing):
             table_format(as_at_the_fit(command, Rows(position=["x,y,z"])))
@@ -46,9 +41,7 @@ def test_units_are_never_guessed() -> None:
         table_format(Units(length="m"))
 
 
-@pytest.mark.parametrize(
-    "words", ["--position 'x,y,z", "--position", "--length furlong", "--lever long --angle deg", "--angle=turns"]
-)
+@pytest.mark.parametrize("words", ["--position 'x,y,z", "--position", "--lever long --angle deg", "--angle=turns"])
 def test_options_that_are_none_are_one_error(words: str) -> None:
     """Whoever sends a model file may have edited the line in it."""
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm {words}"
@@ -110,10 +103,8 @@ UNITS = Rows(length="mm", angle="deg")
 
 
 def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
-    rows = replace(
-        UNITS, position=["x,y,z"], reading=["distance=wire", "image=u,v,9,9,1,1"], socket="place,socket", session="day"
-    )
-    rows = replace(rows, distance=["0,1=50"], distance_std=0.03)
+    kinds: Any = {"reading": ["distance=wire", "image=u,v,9,9,1,1"], "socket": "place,socket", "distance": ["0,1=50"]}
+    rows = replace(UNITS, position=["x,y,z"], session="day", distance_std=0.03, **kinds)
     path = tmp_path / "t.csv"
     path.write_text("q1,x,y,z\n1,2,3,4\n")
     found, missing = rows_in_table(path, rows)

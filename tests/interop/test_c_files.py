@@ -236,9 +236,8 @@ def test_undefined_behaviour_and_addresses(files: CFiles, tmp_path: Path) -> Non
     (tmp_path / "main.c").write_text(MAIN.format(functions="", body=main))
     program, sanitizers = tmp_path / "main", "-fsanitize=undefined,address"
     command = [COMPILER, *C99, "-g", sanitizers, "-fno-sanitize-recover=all", "-I", files.header.parent]
-    linked = subprocess.run(
-        [*command, "-o", program, tmp_path / "main.c", files.source, "-lm"], capture_output=True, text=True, check=False
-    )
+    words = [*command, "-o", program, tmp_path / "main.c", files.source, "-lm"]
+    linked = subprocess.run(words, capture_output=True, text=True, check=False)
     if linked.returncode and "cannot find" in linked.stderr:
         pytest.skip("no sanitizers")
     assert linked.returncode == 0, linked.stderr[:3000]

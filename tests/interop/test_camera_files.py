@@ -55,22 +55,17 @@ def check(known: KnownPose, place: Any, turn: Tensor | None = None) -> None:
         assert bool((torch.from_numpy(small).abs() < 4 * known.deviations[3:]).all())
 
 
-def test_a_camera_on_the_tool_is_where_it_is() -> None:
+def test_cameras_are_where_they_are() -> None:
     found = HandEye.of(on_tool())
     check(found.camera, CAMERA[:3], rotation(torch.tensor(CAMERA[3:], dtype=torch.float64)))
     assert set(found.entry()) == {"camera_in_tip", "board_in_base"}
     assert camera_of(on_tool()).on_tool
-
-
-def test_a_fixed_camera_is_where_it_is() -> None:
     found = HandEye.of(fixed(), camera_on_tool=False)
     check(found.camera, FIXED_CAMERA[0])
     check(found.board, BOARD_ON_FLANGE, torch.eye(3, dtype=torch.float64))
     assert found.camera.link == fixed().robot.base
     assert not camera_of(fixed()).on_tool
-    assert any(
-        "camera in the robot's base (hand-eye transform)" in line for line in hand_eye_sentences({"camera": found})
-    )
+    assert "camera in the robot's base (hand-eye transform)" in "\n".join(hand_eye_sentences({"camera": found}))
 
 
 @pytest.mark.parametrize("model", [on_tool, fixed])

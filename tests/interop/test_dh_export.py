@@ -190,10 +190,8 @@ def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_
     robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
     tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
     zero = torch.zeros(1, 6, dtype=torch.float64)
-    for tip, rest in (
-        (tool, torch.eye(4, dtype=torch.float64)),
-        (robot, torch.linalg.inv(tool(zero)[0]) @ robot(zero)[0]),
-    ):
+    flange = torch.linalg.inv(tool(zero)[0])
+    for tip, rest in ((tool, flange @ tool(zero)[0]), (robot, flange @ robot(zero)[0])):
         geometry, q = wrong(tip, size), configurations(tip)
         write_ur_kinematics(geometry, tmp_path / "ur.yaml")
         links, _ = read_yaml(tmp_path / "ur.yaml")

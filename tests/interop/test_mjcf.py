@@ -55,7 +55,8 @@ def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Pat
             np.testing.assert_allclose(model.eq_data[0, :2], [joint.mimic_offset, *joint.mimic.values()])
 
 
-def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> None:
+def test_limits_masses_inertias_and_names(tmp_path: Path) -> None:
+    """Those of the URDF; of a robot without one bodies have the names of joints."""
     arm = SimulatedArm(seed=0)
     arm.write_urdf(tmp_path / "arm.urdf")
     text = (tmp_path / "arm.urdf").read_text()
@@ -72,9 +73,6 @@ def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> Non
         np.testing.assert_allclose(here.mass, there.mass)
         np.testing.assert_allclose(here.ipos, there.ipos, atol=1e-12)
         np.testing.assert_allclose(inertia(here), inertia(there), rtol=0, atol=1e-9)
-
-
-def test_a_robot_without_a_urdf_has_bodies_named_after_joints() -> None:
     robot = dc.from_dh([(0.3, 0.0, 0.1), (0.2, 0.4, 0.0)], "standard", names=["a", "b"])
     model = mujoco.MjModel.from_xml_string(mjcf_text(wrong(robot)))
     assert {"a", "b"} <= {model.body(number).name for number in range(model.nbody)}

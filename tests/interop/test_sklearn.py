@@ -41,9 +41,8 @@ def fitted(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> Any:
 
 def test_the_checks_of_scikit_learn(arm: Case) -> None:
     reasons = dict.fromkeys(OTHER_TABLES, JOINTS)
-    found = check_estimator(
-        dc.interop.DiffeoRegressor(arm.robot), expected_failed_checks=reasons, on_skip=None, on_fail=None
-    )
+    estimator = dc.interop.DiffeoRegressor(arm.robot)
+    found = check_estimator(estimator, expected_failed_checks=reasons, on_skip=None, on_fail=None)
     failed = [one["check_name"] for one in found if one["status"] == "failed"]
     assert failed == []
     assert {one["check_name"] for one in found if one["status"] == "xfail"} == set(reasons)

@@ -102,9 +102,7 @@ def test_a_folder_that_nobody_else_can_replace_is_used(case: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("home", ["", "relative"])
-def test_without_a_home_nothing_is_written_into_the_current_folder(
-    home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_home(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", home)
     monkeypatch.setenv("XDG_CACHE_HOME", "relative too")

@@ -54,26 +54,21 @@ def test_the_exponential_is_exact_to_rounding() -> None:
     assert float(found[0]) == 1.0
 
 
-def test_points_that_are_not_finite_are_seen() -> None:
+def test_points_that_are_not_finite_or_far_away() -> None:
+    """The first are seen; the others add nothing: a large polynomial times an exponential that is zero."""
     unusual = torch.tensor(0x7FF80000000007A2).view(torch.float64)  # NaN with other bits, such as R's "not available"
     for value in (float("nan"), float("inf"), unusual):
         j = points(40, 2)
         j.features[7, 1] = value
         assert all(bool(t.isnan().any()) for t in fused(FULL, GaussianProfile(), None, j))
         assert bool(fused(FIELD, GaussianProfile(), None, j)[0][7].isnan().all())
-
-
-def test_points_that_are_far_away_add_nothing() -> None:
-    """A large polynomial times an exponential that is zero, not the smallest number."""
     i, j = points(4, 1), points(30, 2)
     i.features[:] = 1e100
     for nu in (1.5, 3.5):
         assert not any(bool(t.any()) for t in fused(GRADIENT, MaternProfile(nu), i, j))
 
 
-def test_numbers_of_a_profile_are_noticed_when_they_change_but_not_compiled_for_ever(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_numbers_of_a_profile_that_change(monkeypatch: pytest.MonkeyPatch) -> None:
     """Profiles may read constants of their class or module, or the contents of an object; these may be optimised."""
     monkeypatch.setattr(sums, "MOST_VARIANTS", 2)
     numbers: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Every kernel of the bank: the properties of a reproducing kernel, and its textbook formula."""
+"""Every kernel of the bank: the properties of a reproducing kernel, and its textbook formula; profiles at zero."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.profiles import GaussianProfile
+from diffeo_calib.kernels.profiles import MAX_ORDER, PROFILES, GaussianProfile
 from diffeo_calib.kernels.radial import RadialKernel
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
@@ -39,11 +39,8 @@ def test_points_and_momenta_of_other_shapes_are_refused() -> None:
     case = case_named("sum-output")
     (x, q, a), k = data(case), case.kernel
     for wrong in (a[:-1], a[:, :-1], a[0]):
-        for method in (
-            k.field,
-            lambda _, q, a: k.hamiltonian_gradient(q, a),
-            lambda _, q, a: k.hessian_product(q, a, q, a),
-        ):
+        of_two = lambda _, q, a: k.hamiltonian_gradient(q, a), lambda _, q, a: k.hessian_product(q, a, q, a)
+        for method in (k.field, *of_two):
             with pytest.raises(InputError, match="the momenta `a`"):
                 method(x, q, wrong)
     for wrong in (torch.cat([x, x], 1), x[:, :-1]):
@@ -68,10 +65,8 @@ def test_matrix_is_the_textbook_formula_symmetric_and_positive_semi_definite(cas
 def test_kernel_has_the_period_of_its_space(case: Case) -> None:
     x, q, a = data(case)
     turns = torch.round(3 * normal(M, case.dim, seed=4)) * 2 * torch.pi * torch.tensor(case.space.periodic)
-    for actual, expected in zip(
-        case.kernel.field_and_jacobian(x + turns, q, a), case.kernel.field_and_jacobian(x, q, a), strict=True
-    ):
-        torch.testing.assert_close(actual, expected, rtol=0, atol=2e-13)
+    found, expected = (case.kernel.field_and_jacobian(at, q, a) for at in (x + turns, x))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-13)
 
 
 @every_case
@@ -131,10 +126,7 @@ def test_coinciding_points_do_no_harm(case: Case) -> None:
 def test_gram_has_the_explicit_blocks(case: Case) -> None:
     x, y = case.points(4, seed=1), case.points(3, seed=2)
     left, right = normal(4, 2, case.dim, seed=3), normal(3, 5, case.dim, seed=4)
-    rows = [
-        torch.cat([left[i] @ case.pair(x[i], y[j]) @ right[j].T for j in range(3)], 1)  # (2, 5) each
-        for i in range(4)
-    ]
+    rows = [torch.cat([left[i] @ case.pair(x[i], y[j]) @ right[j].T for j in range(3)], 1) for i in range(4)]  # (2, 15)
     torch.testing.assert_close(case.kernel.gram(x, left, y, right), torch.cat(rows), rtol=1e-12, atol=1e-13)
 
 
@@ -161,10 +153,7 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     "zero concentration": (lambda: dc.VonMises([1.0, 0.0]), "`concentration`: expected positive"),
     "negative variance": (lambda: dc.Gaussian(1.0, [1.0, -2.0]), "`variance`: expected non-negative"),
     "a word": (lambda: dc.Gaussian("wide"), "`lengthscale` cannot be read as numbers"),
-    "vector variance with one output": (
-        lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0),
-        "one output: expected a scalar",
-    ),
+    "a vector": (lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0), "one output: expected"),
     "per-joint scales": (lambda: dc.PerJoint([1.0, 1.0], [1.0, 1.0, 1.0], circle(3)), "`lengthscale` has the wrong"),
     "per-joint variances": (lambda: dc.PerJoint([1.0] * 3, [1.0], circle(3)), "`variance` has the wrong shape"),
     "no term": (lambda: SumKernel([]), "at least one term"),
@@ -194,3 +183,25 @@ WRONG_DIMENSION: dict[str, tuple[Kernel, int]] = {
 def test_kernels_of_another_dimension_are_refused(kernel: Kernel, dim: int) -> None:
     with pytest.raises(InputError):
         kernel.check(dim, "joint_kernel")
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_at_zero_values_are_one_and_all_is_finite(name: str) -> None:
+    """And the slope is that of 1 - nu / (2 (nu - 1)) r2 + ..., of a Matern kernel."""
+    profile, r2 = PROFILES[name], tensor([0.0, 1e-300, 1e-17, 1e-16]).requires_grad_()
+    assert float(profile.derivative(tensor(0.0), 0)) == 1.0
+    values = profile.derivatives(r2, MAX_ORDER)
+    (first,) = torch.autograd.grad(values[0].sum(), r2)
+    for value in (*values, first):
+        assert bool(torch.isfinite(value).all())
+    if (nu := getattr(profile, "nu", None)) is not None:
+        assert float(first[0]) == pytest.approx(-nu / (2 * (nu - 1)), rel=1e-15)
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_differentiating_too_often_is_refused(name: str) -> None:
+    if isinstance(PROFILES[name], GaussianProfile):
+        return  # one exponential, which autograd follows as often as it likes
+    r2 = tensor([0.5]).requires_grad_()
+    with pytest.raises(InputError, match="too often"):
+        PROFILES[name].derivatives(r2, MAX_ORDER)[MAX_ORDER].sum().backward()

@@ -169,9 +169,7 @@ def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], ba
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("usable", [True, False])
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_auto_chooses_by_size_and_device(
-    monkeypatch: pytest.MonkeyPatch, device: str, usable: bool, compiled: bool
-) -> None:
+def test_auto_chooses_a_backend(monkeypatch: pytest.MonkeyPatch, device: str, usable: bool, compiled: bool) -> None:
     monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: usable)
     monkeypatch.setattr(backends.FUSED, "trouble", lambda: "" if compiled else "not here")
     here, most, fewest = torch.device(device), backends.DENSE_PAIRS[device], backends.KEOPS_PAIRS

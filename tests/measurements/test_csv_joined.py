@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,7 @@ JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
 PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")
 
 
-def joined(
-    folder: Path, joints: tuple[str, ...] = JOINTS, places: tuple[str, ...] = PLACES, by: str = "pose", **how: bool
-) -> HeldFile:
+def joined(folder: Path, joints: Any = JOINTS, places: Any = PLACES, by: str = "pose", **how: bool) -> HeldFile:
     for name, lines in (("joints", joints), ("places", places)):
         (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
     return joined_file(folder / "joints.csv", folder / "places.csv", by, **how)
@@ -70,12 +69,11 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
 
 
-@pytest.mark.parametrize(
-    ("places", "order"), [((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])]
-)
-def test_a_row_each_of_the_same_stops_by_two_clocks(
-    places: tuple[float, ...], order: list[int], tmp_path: Path
-) -> None:
+CLOCKS = ((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])
+
+
+@pytest.mark.parametrize(("places", "order"), CLOCKS)
+def test_the_same_stops_by_two_clocks(places: tuple[float, ...], order: list[int], tmp_path: Path) -> None:
     """Pauses that agree tell the offset; else the times are compared as they are."""
     files = ("t,a", "0,1", "3,2", "11,3"), ("t,x", *(f"{t},{k}" for k, t in enumerate(places)))
     if not order:  # pauses of other stops

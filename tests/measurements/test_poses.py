@@ -57,7 +57,7 @@ def test_round_trips(angle: str) -> None:
         assert_close(found, matrices, rtol=0, atol=2e-4)
 
 
-def test_euler_angles_are_turns_in_their_order() -> None:
+def test_conventions_written_out() -> None:
     """Extrinsic: the rotation of the last letter is the leftmost factor; intrinsic: that of the first letter."""
     a, b, c = 0.3, -0.7, 2.1
     for order in ORDERS:
@@ -68,9 +68,6 @@ def test_euler_angles_are_turns_in_their_order() -> None:
         np.testing.assert_allclose(degrees[0], expected, atol=1e-14)
     matrices = rotation_matrices([[0.3, math.pi / 2, 0.4]], "XYZ")  # gimbal lock; warnings are errors here
     assert_close(rotation_matrices(rotation_numbers(matrices, "XYZ"), "XYZ"), matrices, rtol=0, atol=1e-7)
-
-
-def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     half = math.pi / 6  # a turn of 60 degrees about z
     expected = torch.from_numpy(turn("z", 2 * half))[None]
     c, s = math.cos(half), math.sin(half)
@@ -83,10 +80,6 @@ def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     ):
         assert_close(rotation_matrices([numbers], convention), expected, rtol=0, atol=1e-15)
     assert_close(rotation_matrices([[0, 0, 60]], "rotvec", angle="deg"), expected, rtol=0, atol=1e-15)
-
-
-def test_controllers_name_their_conventions() -> None:
-    """KUKA: A about z, then B about the new y, C about the newest x; Fanuc: W, P, R about the fixed x, y, z."""
     a, b, c = 0.3, -0.7, 1.1
     expected = turn("z", a) @ turn("y", b) @ turn("x", c)
     for name, numbers in (("kuka_abc", [a, b, c]), ("fanuc_wpr", [c, b, a])):

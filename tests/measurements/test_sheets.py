@@ -43,10 +43,8 @@ def _two_sheets(path: Path) -> None:
 def _joined_sheets(path: Path) -> None:
     """Joints and places of the same stops, in another order; the first is at zero, and no line has a remark."""
     book = openpyxl.Workbook()
-    for title, names, values in (
-        ("robot", ["q_1", "q_2", "remark"], JOINTS),
-        ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1]),
-    ):
+    both = ("robot", ["q_1", "q_2", "remark"], JOINTS), ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1])
+    for title, names, values in both:
         stops = range(7) if title == "robot" else reversed(range(7))
         rows = [["stop", *names], *([k, *own] for k, own in zip(stops, values.tolist(), strict=True))]
         sheet = book.create_sheet(title)
@@ -70,11 +68,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "two sheets of the same stops": ("t.xlsx", _joined_sheets, *NAMES),
     "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
     "an array with names": ("t.npy", _named, *NAMES),
-    "arrays": (
-        "t.npz",
-        lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.ones((2, 4)), dh=np.ones((2, 3))),
-        *NAMES,
-    ),
+    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.ones((2, 4)), dh=np.eye(3)), *NAMES),
     "arrays of columns": ("t.npz", lambda path: np.savez(path, q=JOINTS.T, p=PLACES.T, s=np.eye(3)), *NAMES),
     "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
     "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
@@ -113,7 +107,7 @@ def test_lengths_in_every_unit(length: str, metres: float, tmp_path: Path) -> No
     torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES))
 
 
-def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
+def test_lines_and_columns(tmp_path: Path) -> None:
     """Whatever size the file says that the sheet has: some programs write that of one cell."""
     _book(tmp_path / "t.xlsx")
     with ZipFile(tmp_path / "t.xlsx") as book, ZipFile(tmp_path / "one.xlsx", "w") as other:
@@ -122,9 +116,6 @@ def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
     for name in ("t.xlsx", "one.xlsx"):
         rows = CsvLines(tmp_path / name, ",").rows()
         assert [line for line, _ in rows] == list(range(4, 11))
-
-
-def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
     file = CsvLines(tmp_path / "t.npz", ",")

@@ -57,10 +57,8 @@ FILES = {"crooked": ("world", "end"), "crooked from the middle": ("a", "end"), "
 @pytest.mark.parametrize("name", [*FILES, "simulated arm", "ur10", *VIEWS])
 def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Of tips in the base; the Jacobian where the base stands on the ground."""
-    path, (base, tips, loads) = (
-        tmp_path / "robot.urdf",
-        VIEWS.get(name, (*FILES.get(name, ("base_link", "flange")), [])),
-    )
+    path = tmp_path / "robot.urdf"
+    base, tips, loads = VIEWS.get(name, (*FILES.get(name, ("base_link", "flange")), []))
     if name == "ur10":
         path, tips = request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "ee_link"
     elif name == "simulated arm":
