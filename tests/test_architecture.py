@@ -152,7 +152,6 @@ def test_no_import_cycles() -> None:
 
 
 def habits(module: str, tree: ast.Module) -> Iterator[str]:
-    """What a file of the package must not do."""
     if not ast.get_docstring(tree):
         yield f"{module}: begin the file with a docstring"
     for node in ast.walk(tree):
@@ -171,7 +170,6 @@ def test_says_what_it_is_and_neither_prints_nor_asserts() -> None:
 
 
 def test_files_of_tests_have_names_of_their_own() -> None:
-    """Pytest imports them by these."""
     names = Counter(path.name for path in (PACKAGE.parent / "tests").rglob("test_*.py"))
     assert [name for name, count in names.items() if count > 1] == []
 
@@ -197,7 +195,6 @@ ARROWS = [
 
 
 def test_mistakes_are_found() -> None:
-    """In floors, branches on a kind, and silent lines."""
     root = PACKAGE.name
     for module, other, allowed in ARROWS:
         mistakes = floor_mistakes(f"{root}.{module}", [(f"{root}.{other}".rstrip("."), 1)])
@@ -246,7 +243,6 @@ THROUGH = {"len", "bool", "int", "float"}
 
 
 def branches(root: Path) -> dict[str, list[int]]:
-    """Lines of the branches on a kind, by file, of the package in ``root``."""
     found = {}
     for path in (path for room in ROOMS for path in sorted((root / room).rglob("*.py"))):
         name = path.relative_to(root).as_posix()
@@ -256,7 +252,6 @@ def branches(root: Path) -> dict[str, list[int]]:
 
 
 def lines_of(source: str) -> list[int]:
-    """Lines of the branches on a kind in a file."""
     return sorted(test.lineno for test in _tests(ast.parse(source)) if any(map(_asks, _deciding(test))))
 
 
@@ -314,7 +309,6 @@ def test_no_branches_on_a_kind() -> None:
 
 
 def test_one_table_of_the_priors_of_places() -> None:
-    """Numbers are in robots/placement.py alone."""
     pattern = re.compile(r"^[A-Z_]*(PLACE|BASE|TOOL|FRAME|MARKER|TURN|BALL)_DEVIATION[A-Z_]* = .*[0-9]", re.MULTILINE)
     assert pattern.search("PLACE_DEVIATION_M = 0.1")
     found = [path.name for path in SOURCES.values() if pattern.search(path.read_text(encoding="utf-8"))]

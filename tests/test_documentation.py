@@ -35,7 +35,6 @@ def snippets(text: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated arm and tables of its measurements under the names of the documentation, with fewer rows."""
     place = tmp_path_factory.mktemp("documentation")
     write_tables(place, rows=50)
     return place
@@ -73,7 +72,6 @@ def test_options_of_pages_that_run_elsewhere_are_known(name: str) -> None:
 
 @pytest.mark.slow
 def test_snippets_run_one_after_the_other(folder: Path, command: Command) -> None:
-    """Without a warning; scales of the simulated robot are given."""
     code, calibrate = dict.fromkeys(snippet for text in texts().values() for snippet in snippets(text)), dc.calibrate
     (folder / "snippets.py").write_text("\n".join(code), encoding="utf-8")
     given = lambda robot, *rows, **how: calibrate(robot, *rows, **{"hyperparameters": usual_scales(robot)} | how)  # noqa: E731

@@ -23,7 +23,6 @@ Law = Callable[[Kind, Any], Any]
 
 
 def lines(model: Any, rows: Any) -> Lines:
-    """Kind and line of every row -> name of its device, and its errors."""
     found: Any = dc.evaluate(model, rows)
     each = {}
     for one in found.values() if isinstance(found, Mapping) else [found]:
@@ -73,7 +72,6 @@ def test_a_model_is_saved_whole(kind: str) -> None:
 
 
 def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
-    """Of positions beside rows in sockets, whose places move along."""
     kind, T = kind_named("mixture"), twist_transform(ELSEWHERE)
     parts: Any = kind.data.parts
     measured, others = ([part for part in parts if part.without_device is free] for free in (False, True))
@@ -85,7 +83,6 @@ def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
 
 
 def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, ...]:
-    """Positions, and distances of devices with and without a known zero."""
     arm = SimulatedArm(0, markers=2)
     q, points = arm.measure(40, seed=5)
     tables = [reading_bank.readings(arm, "distance", 48, zero, noise=2e-5, seed=3 + bool(zero)) for zero in (0.0, 0.03)]
@@ -95,7 +92,6 @@ def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, ...
 
 
 def test_devices_with_and_without_a_known_zero() -> None:
-    """All are known to the model; one name for both, and deviations of a part of the readings, are refused."""
     tables = wires()
     data = dc.Observations.joined(tables)
     model = dc.calibrate(SimulatedArm(0).nominal, data, hyperparameters=reading_bank.scales()).model  # pyright: ignore
@@ -191,7 +187,6 @@ def test_rows_that_are_all_alone_in_their_sockets_are_refused(verb: Callable[[An
 
 @pytest.mark.parametrize("name", ["several kinds", "inclinations", "images and a tracker"])
 def test_devices_are_kept_where_positions_alone_are_registered(name: str) -> None:
-    """Twice, by another device each time, and beside it again."""
     kind = kind_named(name)
     model, before = kind.model, dc.evaluate(kind.model, kind.new)
     names = [own.names for own in model.placement]
@@ -245,7 +240,6 @@ def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
 
 
 def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:
-    """Numbers of the rows that a registration leaves out."""
     found = model.registered(rows.with_line_numbers(torch.arange(len(rows))), **options).registration
     assert found is not None
     return found.outliers

@@ -78,12 +78,10 @@ class Bench:
 
     @property
     def mass(self) -> list[str]:
-        """The option of commands that need one payload."""
         return ["--payload", "4"] * (self.kind.name == "payloads")
 
     @property
     def one_tip(self) -> list[str]:
-        """The option of exports that hold one tip."""
         tips = self.kind.robot.tips
         return ["--tip", tips[0]] * (len(tips) > 1)
 
@@ -95,7 +93,6 @@ class Bench:
         return done
 
     def json(self, *words: object) -> dict[str, Any]:
-        """The results of a command, for programs."""
         path = self.folder / "results.json"
         return results(path, self.run(*words, "--json", path))
 
@@ -117,7 +114,6 @@ class Bench:
         return found | {"said": text}
 
     def joints(self, count: int = 4) -> Path:
-        """A table of joint values in deg."""
         path, names = self.folder / "joints.csv", self.kind.robot.joint_names
         rows = self.kind.q(count).rad2deg().tolist()
         path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]))
@@ -159,7 +155,6 @@ def verb(name: str, *kinds: str) -> Callable[[Verb], Verb]:
 
 
 def _leaves(entry: Any) -> Iterator[tuple[str, str]]:
-    """What each evaluation of a tree is, and its unit."""
     if "unit" in entry:
         yield entry["what"], entry["unit"]
     else:
@@ -168,7 +163,6 @@ def _leaves(entry: Any) -> Iterator[tuple[str, str]]:
 
 
 def evaluations(found: Any) -> list[Any]:
-    """Those of every kind of row."""
     return list(found.values()) if isinstance(found, Mapping) else [found]
 
 
@@ -219,7 +213,6 @@ def _(bench: Bench) -> None:
 
 @verb("evaluate")
 def _(bench: Bench) -> None:
-    """In Python, and as a command, whose numbers are the same."""
     kind, path = bench.kind, bench.folder / "residuals.csv"
     own: Any = dc.evaluate(kind.model, kind.new)
     each = evaluations(own)
@@ -256,7 +249,6 @@ def _(bench: Bench) -> None:
 
 @verb("register")
 def _(bench: Bench) -> None:
-    """In Python, and by `evaluate --free both`, which writes the same model."""
     kind, path = bench.kind, bench.folder / "moved.safetensors"
     check_accuracy(kind, kind.registered, NEW_ROWS_FACTOR)
     table, options = kind.table("moved")

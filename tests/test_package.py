@@ -63,7 +63,6 @@ def test_help_and_the_page_say_what_the_fields_of_results_and_tables_are(name: s
 
 
 def test_names_are_those_that_are_loaded() -> None:
-    """Those that type checkers see; others are attribute errors."""
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     (checking,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     imports = [node for node in ast.walk(checking) if isinstance(node, ast.ImportFrom)]

@@ -26,7 +26,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Those of both programs, which load everything once."""
     folder, env = tmp_path_factory.mktemp("kills"), environment()
     env["PYTHONPATH"] = os.pathsep.join([*map(str, FOLDERS), env["PYTHONPATH"]])
     command = [sys.executable, "-c", PROGRAM]

@@ -25,7 +25,6 @@ METHODS: tuple[type[Method], ...] = (ours.Ours, ours.Dense, ours.Tiled, peers.Na
 
 @pytest.fixture(scope="module")
 def data() -> Landmarks:
-    """More points than a tile has rows."""
     return landmarks(300, 3)
 
 
@@ -39,7 +38,6 @@ def test_results_are_exact(data: Landmarks, method: type[Method], task: str) -> 
 
 
 def test_repeats_stay_on_one_side_and_all_rows_are_used() -> None:
-    """50 configurations, each measured twice."""
     q, points = SimulatedArm(seed=1).measure(50)
     data = dc.Measurements(torch.cat([q, q + 1e-5]), torch.cat([points, points + 1e-6]))
     found = list(protocols.splits(data, protocols.PROTOCOLS, [30, None], seeds=2))

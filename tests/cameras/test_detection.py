@@ -26,7 +26,6 @@ FOUND = Board.of(BOARD)
 
 
 def flat(board: str, pixels: int = 60) -> np.ndarray:
-    """A sheet with a chessboard or a single marker, seen straight ahead."""
     kind, *words = board.split(":")
     if kind == "chessboard":
         across, down = map(int, words[0].split("x"))

@@ -101,7 +101,6 @@ def test_images_of_one_camera_in_two_parts_with_a_known_lens_tell_the_same() -> 
 
 
 def test_poses_and_shared_errors_are_the_whole_posterior() -> None:
-    """The marginal covariance of all poses from the dense information of all unknowns."""
     few, _ = images(5, NOISE, seed=3)
     found = sighted(few)
     N, scale = len(found.poses), found.camera.noise
@@ -141,7 +140,6 @@ def test_opencv_finds_the_same_lens() -> None:
 
 
 def test_wrong_corners_a_longer_focal_length_and_sentences() -> None:
-    """Wrong corners hardly count; a longer focal length is an error of the lens alone."""
     pixels = IMAGES.pixels.clone()
     pixels[::3, 5] += 30.0
     away = (sighted(replace(IMAGES, pixels=pixels)).camera.unknowns - CAMERA.unknowns) / FOUND.camera.deviations

@@ -259,7 +259,6 @@ WORDS = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--base", "ba
 
 
 def row(number: int, **more: Any) -> bytes:
-    """A row as a line."""
     q, y = ARM.measure(1, seed=number)
     values = dict(zip([*ARM.nominal.joint_names, "x", "y", "z"], [*q[0].tolist(), *y[0, 0].tolist()], strict=True))
     return (json.dumps({"id": number, **values, **more}) + "\n").encode()
@@ -378,7 +377,6 @@ def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Out
 
 
 def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
-    """The next row lost its first characters, and was accepted."""
     path = tmp_path / "run.csv"
 
     def lines() -> Iterator[bytes]:

@@ -30,7 +30,6 @@ def answer(page: Page, method: str, path: str, **headers: str) -> int:
 
 
 def decided(page: Page) -> list[tuple[str, int]]:
-    """What two buttons decided."""
     both = page.decisions.get(timeout=5), page.decisions.get(timeout=5)
     return [(one["do"], one["line"]) for one in both if isinstance(one, dict)]
 

@@ -74,7 +74,6 @@ def test_wished_places_are_no_markers(measured: str, wished: str) -> None:
 
 
 def test_markers_deviations_and_rotations() -> None:
-    """Two markers stay two; deviations and rotations are named as the places that they are of."""
     for one, other in (("{}", "{}"), *(("b_{}", name) for name in ("left_{}", "{}1", "target 1 {}", "m{}"))):
         both = [triple(one), triple(other, "XYZ")]
         assert bodies_in([*both[0], *both[1]]) == [Body(names, []) for names in both]

@@ -72,14 +72,12 @@ def at_one_place(path: Path) -> Path:
 
 
 def without_turns(path: Path) -> Path:
-    """Every convention explains the rows."""
     commanded = flange()
     commanded[:, :3, :3] = commanded[0, :3, :3]
     return from_the_tool(path, commanded, "rotvec")
 
 
 def rotations_first(path: Path) -> Path:
-    """With a row without a board."""
     commanded, found = flange(), seen(flange(), camera_on_tool=True)
     turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (found, ("quat_xyzw",)))]
     poses = {"RX_RY_RZ": turns[0].rad2deg(), "X_Y_Z": 1e3 * commanded[:, :3, 3]}
@@ -242,7 +240,6 @@ def check_hand_eye(path: Path, **truths: Tensor) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
-    """And the same poses again: predicted and planned under the names of the table, and corrected by little."""
     table, model, out = from_the_tool(tmp_path / "t.csv", flange()), tmp_path / "t.safetensors", tmp_path / "f.json"
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", out, "--report", tmp_path / "r")
@@ -291,7 +288,6 @@ def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command, 
 
 @pytest.mark.usefixtures("given_scales")
 def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> None:
-    """The camera's place along the axis is open, which is said, and the next poses tilt."""
     commanded = flange()
     turn = torch.stack([*torch.zeros(2, len(commanded), dtype=torch.float64), drawn(len(commanded), seed=4)], 1)
     commanded[:, :3, :3] = turned(turn) @ torch.tensor(DOWN, dtype=torch.float64)

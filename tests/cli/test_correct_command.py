@@ -61,7 +61,6 @@ def model(arm: Case, tmp_path: Path) -> dc.CalibratedKinematics:
 
 @pytest.fixture
 def program(arm: Case, tmp_path: Path) -> Path:
-    """Commands around the measured ones, between columns that mean nothing here."""
     q = np.degrees(arm.train.q[:12].numpy()) + np.random.default_rng(0).uniform(-1, 1, (12, 6))
     joints = [dict(zip(arm.robot.joint_names, map(written, row), strict=True)) for row in q.round(6).tolist()]
     write(tmp_path / "program.csv", [{"line": str(10 * k), **own, "note": f"a;b {k}"} for k, own in enumerate(joints)])
@@ -139,7 +138,6 @@ def test_a_target_at_the_origin_stays_and_one_without_numbers_is_named(tmp_path:
 
 @pytest.mark.usefixtures("model")
 def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
-    """Far targets and commands beyond the limits: the others are corrected, and the exit code is 0."""
     rows = read(program)
     names = [name for name in rows[0] if name not in ("line", "note")]
     rows[3][names[1]] = "900,0"
@@ -244,7 +242,6 @@ BOTH = ["--tip", "left", "--tip", "right"]
     ],
 )
 def test_wrong_options(options: list[str], message: str, program: Path, command: Command) -> None:
-    """Of a robot with two tips where some are named."""
     output, path = program.with_name("c.csv"), program.with_name("model.safetensors")
     if not options or "--tip" in options:
         arms = model_of(two_arms(program.parent), dc.RK4(1))

@@ -71,7 +71,6 @@ def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, comman
     ],
 )
 def test_errors_that_no_robot_has(options: list[str], words: str, site: Site, path: Path, command: Command) -> None:
-    """A wrong unit, a left-handed frame: no table, and one sentence that names the mistake."""
     done = command("evaluate", path, site.csv, *(TABLE[2:] if "--position" in options else TABLE), *options)
     assert done.code == 1
     assert "in all" not in done.out
@@ -79,7 +78,6 @@ def test_errors_that_no_robot_has(options: list[str], words: str, site: Site, pa
 
 
 def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """Copies with fewer digits, and among the new rows; one wrong row and a block with its cause, exit code 0."""
     (train, test), copies = site.data.split(0.7, seed=0), site.data[[0, 1, 1]]
     q, points = site.data.q.round(decimals=4), site.data.points
     for one, own, count in ((q, points, len(train)), (test.q, test.points, 0)):
@@ -99,7 +97,6 @@ def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command,
 
 
 def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
-    """In blocks of seven rows."""
     command.monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", 7)
     done = command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv")
     assert (done.code, done.err.strip()) == (0, "")

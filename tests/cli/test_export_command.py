@@ -22,7 +22,6 @@ def path(arm: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def row(done: Outcome, label: str) -> list[float]:
-    """The numbers of one row of the printed table, mm."""
     (line,) = [line for line in done.out.splitlines() if line.startswith(f"│ {label} ")]
     return [float(cell) for cell in line.split("│")[2:-1] if cell.strip()]
 
@@ -89,7 +88,6 @@ def test_all_files_of_one_command(arm: Case, path: Path, command: Command, tmp_p
     ],
 )
 def test_wrong_options(words: str, message: str, path: Path, command: Command, tmp_path: Path) -> None:
-    """Nothing is written where one file cannot be made."""
     command.monkeypatch.chdir(tmp_path)
     done = command("export", path, *words.split())
     assert done.code in (1, 2)

@@ -39,7 +39,6 @@ OPENING = torch.linspace(0.0, 50.0, ROWS, dtype=torch.float64)[
 
 
 def write_arm(folder: Path, *joints: tuple[str, ...]) -> None:
-    """The arm with more joints."""
     ARM.write_urdf(folder / "arm.urdf")
     text = (folder / "arm.urdf").read_text()
     text = text.replace("</robot>", "".join(JOINT.format(*joint) for joint in joints) + "</robot>")
@@ -126,7 +125,6 @@ def test_the_convention_of_a_table(convention: str, tmp_path: Path, command: Com
 
 
 def test_of_equal_series_the_robot_decides(proposed: Proposed, tmp_path: Path, command: Command) -> None:
-    """Where it does not tell them apart the user is asked."""
     (q, points), other = rows(), [f"A{k}" for k in range(1, 7)]
     written, text = proposed((other, noise(ROWS, 6, size=40.0)), (SERIES, q), (XYZ, points))
     assert written["joints"] == ",".join(SERIES)
@@ -262,7 +260,6 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
 
 @pytest.mark.slow
 def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
-    """Meanings that nothing tells apart are for the user."""
     q, points = rows()
     read = q * torch.tensor([1.0, -1.0, 1.0, 1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 90.0, 0.0, 0.0, 0.0])
     found, text = proposed((NAMES, read), (XYZ, points))
@@ -284,7 +281,6 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
 
 @pytest.mark.parametrize("table", [TableFormat("m", "rad", ";", ","), TableFormat("mm", "deg", "\t")])
 def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, command: Command) -> None:
-    """Of two markers, for a campaign in another folder."""
     arm = SimulatedArm(seed=3, markers=2)
     arm.write_urdf(tmp_path / "arm.urdf")
     data = dc.Measurements(*arm.measure(60, seed=0), NAMES)

@@ -102,7 +102,6 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, frame: Any, init: Prop
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
 def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
-    """The options that `init` writes read the table as those that wrote it."""
     kind = kind_named(name)
     table, options = kind.table()
     written, _ = init(table, kind.urdf)

@@ -34,7 +34,6 @@ def test_the_schema_is_one_and_knows_what_commands_add() -> None:
 
 
 def test_errors_and_places_that_are_taken(folder: Path, command: Command) -> None:
-    """An error is written too, but not over other files."""
     words = "evaluate", "none.safetensors", folder / "new.csv", *UNITS, "--json", folder / "out.json"
     assert command(*words).code == 1
     written = json.loads((folder / "out.json").read_text(encoding="utf-8"))

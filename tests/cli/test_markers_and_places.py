@@ -93,7 +93,6 @@ def test_options_that_do_not_go_together(words: list[str], message: str, files: 
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
-    """From two files to a model, and to the errors of a table of some markers in another order."""
     init(files.joints, files.urdf, "--places", files.places)
     done = command("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
     assert done.code == 0, done.err

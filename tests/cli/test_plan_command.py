@@ -16,7 +16,6 @@ UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 
 
 def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
-    """Joint values, rad, and ranks."""
     with path.open(newline="") as file:
         ranks = [int(row["rank"]) for row in csv.DictReader(file, delimiter=";")]
     return read_joints(path, replace(FORMAT, joints=robot)), ranks

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.slow  # fits
 
 @pytest.fixture(scope="module")
 def files(arm: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """An old model and a new table of 15 rows."""
     folder = tmp_path_factory.mktemp("again")
     dc.save(arm.model, folder / "old.safetensors")
     robot = simulated(1)[0]
@@ -47,7 +46,6 @@ def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Comman
 
 
 def written(path: Path, q: Tensor) -> str:
-    """Rows of the arm at these configurations, as a table."""
     robot = simulated(1)[0]
     data = dc.Measurements(q, robot.true_points(q), joint_names=robot.nominal.joint_names, doubt=False)
     write_measurements(path, data, FORMAT, position=[POSITION.split(",")])

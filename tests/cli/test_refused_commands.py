@@ -98,7 +98,6 @@ def test_what_fit_refuses(message: str, small_site: Site, command: Command, tmp_
 
 @pytest.mark.slow
 def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
-    """tests/interop damages files in every way."""
     model, csv, out = tmp_path / "model.safetensors", small_site.csv, ["-o", tmp_path / "p.csv"]
     x = np.random.default_rng(0).uniform(-1, 1, (6, 2))
     kernels = dc.VonMises(1.0), dc.Gaussian(1.0)

@@ -24,7 +24,6 @@ SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std",
 
 @pytest.fixture(scope="module")
 def sockets(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table of 3 places x 2 sockets x 6 rows, and its robot."""
     where, arm = tmp_path_factory.mktemp("sockets"), SimulatedArm(seed=1)
     arm.write_urdf(where / "arm.urdf")
     write_socket_table(where / "t.csv", arm, "ab", 1)
@@ -54,7 +53,6 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
 
 @pytest.fixture(scope="module")
 def wires(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
     where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
     arm.write_urdf(where / "arm.urdf")
     write_wire_table(where / "t.csv", arm, 1)
@@ -127,7 +125,6 @@ def mixtures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def mixed(mixtures: Path) -> Path:
-    """A model file of these rows."""
     robot = dc.load_urdf(mixtures / "arm.urdf", "base_link", "flange")
     columns = {"socket": ["place", "socket"], "distances": {("a", "b"): 0.05}, "distance_std": 1e-5}
     rows = dc.read_measurements(mixtures / "t.csv", robot, ["x", "y", "z"], **columns, length="mm", angle="rad")

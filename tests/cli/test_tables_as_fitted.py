@@ -25,7 +25,6 @@ FIT = (
 
 
 def test_columns_and_units_of_the_fit_unless_typed() -> None:
-    """Units are never guessed."""
     units = Rows(length="mm", angle="deg", sep=";")
     rows = replace(units, position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
     assert as_at_the_fit(FIT, Rows()) == rows

@@ -28,7 +28,6 @@ except InputError as error:
 
 
 def test_replaces_whole_files_and_keeps_permissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The content is on the disk before the name."""
     path = tmp_path / "a.csv"
     path.write_bytes(b"old")
     path.chmod(0o640)
@@ -82,7 +81,6 @@ with WholeFile(sys.argv[1]) as file:
 
 
 def begun(path: Path) -> subprocess.Popen[str]:
-    """A process that has written half of a file and waits."""
     command = [sys.executable, "-B", "-c", WRITER, str(path)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -124,7 +122,6 @@ def test_a_living_writer_is_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("old", [[], ["a.csv"]])
 def test_ctrl_c_leaves_what_there_was(old: list[str], tmp_path: Path) -> None:
-    """So does every error inside of the block."""
     for name in old:
         (tmp_path / name).write_bytes(b"old")
     with begun(tmp_path / "a.csv") as process:
@@ -135,7 +132,6 @@ def test_ctrl_c_leaves_what_there_was(old: list[str], tmp_path: Path) -> None:
 
 
 def test_a_full_disk_a_missing_folder_and_a_pipe(tmp_path: Path) -> None:
-    """Several files are written together or not at all; a pipe directly."""
     paths = [tmp_path / "a.c", tmp_path / "a.h"]
     write_together(dict.fromkeys(paths, b"old"))
     with pytest.raises(InputError, match=r"none.*No such file or directory\); make its folder first"):

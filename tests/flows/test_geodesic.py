@@ -82,7 +82,6 @@ def test_nodes_and_discrete_adjoint_are_those_of_the_naive_integration(case: Cas
 
 @every_case
 def test_velocity_and_its_gradients(case: Case) -> None:
-    """Closed-form backpropagation compared with autograd of the sum, for all inputs together and each alone."""
     x, (q, a), c = case.points(N + 2, seed=1), start(case, 1.0).unbind(0), normal(N + 2, case.dim, seed=8)
     for live in ((True, True, True), (True, False, False), (False, True, False), (False, False, True)):
         inputs = [t.clone().requires_grad_(flag) for t, flag in zip((x, q, a), live, strict=True)]
@@ -145,7 +144,6 @@ def test_jacobians_of_the_controls_are_those_of_passive_points(case: Case, integ
 
 @pytest.mark.parametrize("integrator", [RK4(1), TorchDiffEq(adjoint=True, step_size=1 / 8)], ids=repr)
 def test_gradients_pass_through_flow_and_momenta(integrator: Integrator) -> None:
-    """The model is differentiable in x and in the momenta at the same time."""
     case = case_named("gaussian-mixed")
     q, x, a = case.points(3, seed=2), case.points(2, seed=1), 0.3 * normal(3, 3, seed=3)
     assert torch.autograd.gradcheck(
@@ -170,7 +168,6 @@ def flow_by(integrator: Integrator, at: Tensor = START) -> Flow:
 
 @cache
 def exact() -> Flow:
-    """The flow with many steps of RK4."""
     return flow_by(RK4(128))
 
 

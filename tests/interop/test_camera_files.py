@@ -46,7 +46,6 @@ def camera_of(model: dc.CalibratedKinematics) -> BoardCamera:
 
 
 def check(known: KnownPose, place: Any, turn: Tensor | None = None) -> None:
-    """The true place within 4 standard deviations, and they are no excuse."""
     away = known.pose[:3, 3] - torch.tensor(place, dtype=torch.float64)
     assert bool((away.abs() < 4 * known.deviations[:3]).all())
     assert float(known.deviations[:3].max()) < 2e-3

@@ -186,7 +186,6 @@ def their_poses(links: dict[str, list[float]], q: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.05])
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_path: Path) -> None:
-    """Of any tip beyond the last joint."""
     robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
     tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
     zero = torch.zeros(1, 6, dtype=torch.float64)

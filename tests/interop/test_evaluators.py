@@ -63,7 +63,6 @@ def near(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
 
 
 def scaled(deformation: GeodesicDeformation, joint: float, task: float, errors: float = 1.0) -> GeodesicDeformation:
-    """With momenta and errors of other size."""
     b, p, theta = deformation.momenta.tensors
     momenta = Momenta(joint * b, task * p, errors * theta)
     return GeodesicDeformation(deformation.spec, deformation.x, momenta, deformation.integrator)
@@ -120,14 +119,12 @@ def test_points_slopes_and_poses(by: str, case: str, tmp_path: Path) -> None:
 
 @needs_compiler
 def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As with more controls than are worth tables."""
     monkeypatch.setattr(build, "MOST_TABULATED", 0)
     agree("c", deformation_of(CHAINS["mimic slides"]), tmp_path)
     assert "interpolate" not in (tmp_path / "generated.c").read_text()
 
 
 def test_maps_without_program_or_table() -> None:
-    """Time steps that are not fixed, and functions that are too rough."""
     assert program_of(deformation_of(CHAINS["arm"], integrator=dc.TorchDiffEq())) is None
     assert tabulate([periodic_sum("gaussian", lengthscale=1e-4, count=400)]) is None
 

@@ -22,7 +22,6 @@ MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="
 
 
 def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
-    """Poses (N, 4, 4) of the first tip as MuJoCo has them."""
     data, found = mujoco.MjData(model), torch.eye(4, dtype=torch.float64).repeat(len(q), 1, 1)
     for row, values in enumerate(chain.moving_values(q).numpy()):
         for name, value in zip(chain.moving_names, values, strict=True):
@@ -35,7 +34,6 @@ def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
 
 
 def inertia(body: Any) -> np.ndarray:
-    """(3, 3) about the centre of mass, in the body's axes, kg m^2."""
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, body.iquat)
     return R.reshape(3, 3) @ np.diag(body.inertia) @ R.reshape(3, 3).T
@@ -56,7 +54,6 @@ def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Pat
 
 
 def test_limits_masses_inertias_and_names(tmp_path: Path) -> None:
-    """Those of the URDF; of a robot without one bodies have the names of joints."""
     arm = SimulatedArm(seed=0)
     arm.write_urdf(tmp_path / "arm.urdf")
     text = (tmp_path / "arm.urdf").read_text()

@@ -40,7 +40,6 @@ from diffeo_calib.robots.se3 import twist_transform
 
 
 def test_robot_models_come_back_bit_for_bit(arm: Case, tmp_path: Path) -> None:
-    """Of the other kinds: tests/test_laws_of_kinds.py."""
     model, q = arm.model, arm.test.q[:50]
     dc.save(model, tmp_path / "model.safetensors")
     again = dc.load(tmp_path / "model.safetensors")
@@ -142,7 +141,6 @@ def test_models_without_torch(tmp_path: Path) -> None:
 
 
 def test_arguments(tmp_path: Path) -> None:
-    """Data frames are taken by the names of their columns."""
     path, chain = tmp_path / "model.safetensors", CHAINS["arm"]
     dc.save(model_of(chain), path)
     model, q = load_numpy(path), draw(2, chain.n, seed=5).numpy()
@@ -197,7 +195,6 @@ def test_old_files(expected: dict[str, Any], tmp_path: Path) -> None:
 
 
 def test_where_a_calibration_comes_from(arm: Case, tmp_path: Path) -> None:
-    """Every copy and file keeps it."""
     found = arm.model.provenance
     assert found is not None
     made = datetime.fromisoformat(found.date)

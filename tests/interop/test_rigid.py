@@ -92,7 +92,6 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def test_correction_tables(arm: Case) -> None:
-    """To rounding, command + error(command) = wanted value; they cover what was measured."""
     for table in correction_tables(arm.model):
         command = table.values + table.corrections
         reached = command + arm.model.transmission(table.joint, command)

@@ -89,7 +89,6 @@ def test_data_frames_by_name(arm: Case, fitted: Any, table: tuple[np.ndarray, np
 
 
 def with_scales(arm: Case) -> dc.interop.DiffeoRegressor:
-    """An estimator that need not search for its scales."""
     return dc.interop.DiffeoRegressor(arm.robot, hyperparameters=arm.result.selection.scales)
 
 

@@ -38,7 +38,6 @@ def same(found: Tensor, expected: Tensor, atol: float = 2e-12) -> None:
 
 @pytest.mark.parametrize("name", ["arm", "mimic slides"])
 def test_points_and_tool_poses_of_any_number_of_rows(name: str) -> None:
-    """Robots of every kind: test_evaluators.py."""
     model = made(name, markers=2)
     for q in (queries(model)[:1], queries(model, 40) + 7.0):
         same(TorchProgram(model)(q), model.map.deformation(q).unflatten(1, (2, 3)))
@@ -121,7 +120,6 @@ def test_onnx_needs_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.slow
 def test_exported_and_read_by_another_process(tmp_path: Path) -> None:
-    """One that does not know this package."""
     short, plain = made("one joint", markers=3), fitted_plain("matern52")
     cases = [(short, {"output": "tool_poses", "tool": TOOL}, lambda q: short.tool_poses(q, TOOL)), (plain, {}, plain)]
     inputs = [[queries(which)[:1], queries(which), queries(which, 300)] for which, _, _ in cases]

@@ -161,12 +161,10 @@ def test_kernels_with_an_accuracy(kernel: dc.Kernel) -> None:
     [(GaussianProfile(), 100, 2), (CauchyProfile(), COUNT, 2), (GaussianProfile(), COUNT, 6)],
 )
 def test_no_waves_where_they_do_not_pay(profile: Profile, count: int, dim: int) -> None:
-    """Few points, no spectral density, many coordinates."""
     assert fourier.sums(FIELD, profile, None, cloud(count, dim, 2.0, 1), 1e-3) is None
 
 
 def test_autograd_and_a_lattice_that_misses_the_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both are sums over all pairs."""
     q, a = normal(COUNT, 1, seed=1).requires_grad_(), normal(COUNT, 1, seed=2)
     slopes: list[Tensor] = []
     for kernel in (dc.Gaussian(0.5), dc.Gaussian(0.5).using("tiled", accuracy=1e-2)):

@@ -36,7 +36,6 @@ def compiled(formula: Formula, profile: Profile, rows: Points | None, columns: P
 
 @pytest.mark.parametrize(("formula", "profile"), COMPILED, ids=lambda one: one.name)
 def test_compiled_sums(formula: Formula, profile: Profile, capfd: pytest.CaptureFixture[str]) -> None:
-    """Of strided points too. Import, compilation and sums are silent."""
     for count, rows in ((5, 6), (280, 300)):
         i, j = points(rows, 1), points(count, 2)
         expected = Dense().reduce(formula, profile, i, j)
@@ -59,7 +58,6 @@ def test_single_precision_and_denormal_numbers() -> None:
 
 @pytest.mark.parametrize("live", range(4))
 def test_tiled_sums_replace_keops_where_gradients_are_needed(live: int) -> None:
-    """For each input. Under no_grad KeOps runs, and nothing is recorded."""
     case, gradients = case_named("matern-1.5"), []
     inputs = case.points(6, seed=1), normal(6, 2, seed=4), case.points(5, seed=2), normal(5, 2, seed=3)
     for backend in ("dense", "keops"):

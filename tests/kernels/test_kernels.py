@@ -30,12 +30,10 @@ M, N = 6, 5
 
 
 def data(case: Case) -> tuple[Tensor, Tensor, Tensor]:
-    """Evaluation points, control points, momenta."""
     return case.points(M, seed=1), case.points(N, seed=2), normal(N, case.dim, seed=3)
 
 
 def test_points_and_momenta_of_other_shapes_are_refused() -> None:
-    """More coordinates than the kernel reads would else be ignored."""
     case = case_named("sum-output")
     (x, q, a), k = data(case), case.kernel
     for wrong in (a[:-1], a[:, :-1], a[0]):
@@ -140,7 +138,6 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
 
 @pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
 def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) -> None:
-    """Through gram(), with coinciding points on the diagonal."""
     x = uniform(4, 3, seed=1)
     left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
     scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()

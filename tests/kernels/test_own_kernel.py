@@ -157,7 +157,6 @@ def fitted(kernel: Kernel) -> FittedMap:
 
 
 def test_another_backend_and_kernels_that_cannot_be_saved(tmp_path: Path) -> None:
-    """Kernels that do not keep their arguments are not saved; other backends than the dense matrix cause a warning."""
     with pytest.raises(InputError, match="`change` of the kernel Changed cannot be saved"):
         dc.save(fitted(Changed(lambda K, _: K)), tmp_path / "x")
     with pytest.raises(InputError, match="argument `width` is not an attribute"):

@@ -35,13 +35,10 @@ def bag() -> Bag:
 
 @dataclass
 class Recorder:
-    """Runs `record` on bags that it writes."""
-
     command: Command
     folder: Path
 
     def table(self, bag: Bag | Path, seen: str, *more: str) -> tuple[Any, list[dict[str, str]]]:
-        """What the command says, and the rows of its table."""
         path = bag.write(self.folder / f"bag{id(bag)}") if isinstance(bag, Bag) else bag
         done = self.command("record", path, seen, "-o", self.folder / "run.csv", *more)
         assert done.code == 0, done.err

@@ -57,7 +57,6 @@ def test_mistakes_name_both_files(tmp_path: Path) -> None:
 
 
 def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
-    """Each line of the shorter file has a partner, unless the other one has a gap there."""
     times = [0.0, 1.0, 2.0, 5.0, 6.0, 7.0]
     joints = ("t,a", *(f"{t},{k}" for k, t in enumerate(times)))
     places = ("t,x", "0.8,10", "3.4,11", "6.3,12")
@@ -95,7 +94,6 @@ def angle(times: np.ndarray) -> np.ndarray:
 
 
 def recordings(seed: int = 1) -> tuple[Recording, Recording]:
-    """Joints 100 times, places 130 times a second by a clock that is behind."""
     random, last = np.random.default_rng(seed), STOPS * (STAND_S + MOVE_S)
     joints, seen = np.arange(0, last, 0.01), np.arange(0, last, 1 / 130)
     noisy = place(angle(seen)) + NOISE_M * random.standard_normal((len(seen), 3))

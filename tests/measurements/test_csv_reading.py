@@ -212,7 +212,6 @@ def test_joints_alone_and_records(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [(HEADER + ROWS + ROWS).encode(), b"PK\x03\x04\xff\xfe"])
 def test_a_pipe_is_read_once(content: bytes, tmp_path: Path) -> None:
-    """Joints alone may repeat."""
     pipe, table = tmp_path / "pipe", TableFormat("m", "rad", joints=JOINTS)
     os.mkfifo(pipe)
     feeder = threading.Thread(target=lambda: pipe.write_bytes(content))
@@ -246,7 +245,6 @@ def test_empty_cells_and_usual_marks_hide_a_marker(read: Reader, cell: str) -> N
 
 
 def test_lines_without_joint_values_or_markers(read: Reader) -> None:
-    """They are left out; of several markers they belong to the pose above."""
     rows = [[*NAMES, "ball"], *([*row, "a"] for row in CELLS[:2]), ["", "", "5", "6", "7", "b"], [*CELLS[2], "a"]]
     with pytest.warns(DiffeoCalibWarning, match="no joint values in line 4: 1 row"):
         assert read(separated(",", rows), **FORMAT).line_numbers.tolist() == [2, 3, 5]

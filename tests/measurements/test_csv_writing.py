@@ -60,7 +60,6 @@ def poses() -> dc.Measurements:
 
 
 def on_tips() -> dc.Measurements:
-    """With a hidden frame, and deviations of each."""
     frames, (std, turns) = random_poses(10).unflatten(0, (5, 2)), 1e-3 * values(2, 5, 2, 3).abs()
     frames[2, 1] = torch.nan
     known: dict[str, Any] = {"on": ["l", "r"], "position_std": std, "rotation_std": turns}
@@ -68,7 +67,6 @@ def on_tips() -> dc.Measurements:
 
 
 def boards() -> dc.Measurements:
-    """As a camera on the tool sees them."""
     known: dict[str, Any] = {"position_std": 2e-4, "rotation_std": 1e-3, "camera_on_tool": True}
     return dc.Measurements.from_poses(some(5, seed=9).q, random_poses(5, seed=2), NAMES, **known)
 
@@ -106,7 +104,6 @@ KINDS: dict[str, Any] = {
 
 
 def assert_same(found: Any, wanted: Any) -> None:
-    """Everything but the lines and the file."""
     assert type(found) is type(wanted)
     assert found.joint_names == wanted.joint_names
     assert found.device_names == wanted.device_names
@@ -148,7 +145,6 @@ def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: P
 
 @pytest.mark.parametrize("units", [("mm", "m"), ("m", "mm")])
 def test_slides_keep_their_unit(units: tuple[str, str], tmp_path: Path) -> None:
-    """In tables, in programs and in predictions."""
     robot, path = sliding_robot(), tmp_path / "t.csv"
     data = sliding_measurements(robot, 3)
     table = table_format(Units(length=units[0], angle="deg", joint_length=units[1]))
@@ -241,7 +237,6 @@ def test_what_cannot_be_written(data: Any, how: dict[str, Any], message: str, tm
 
 
 def predictions(path: Path, mean: Tensor, std: Tensor, table: TableFormat, **how: Any) -> tuple[list[str], list[float]]:
-    """Header and numbers of a line."""
     q = torch.tensor([[0.5, 0.25]], dtype=torch.float64)
     write_predictions(path, [(q, mean, std)], table, joints=NAMES, **how)
     header, row = path.read_text().splitlines()
@@ -269,7 +264,6 @@ def test_predictions_are_written(tmp_path: Path) -> None:
 
 
 def test_lines_of_two_kinds_and_of_none(tmp_path: Path) -> None:
-    """Two kinds are two rows; a socket that is not a number is none, as a program writes numbers and names."""
     rows = "0,1,1,2,3,,,,\n1,2,,,,1.5,,A,0.1\n2,3,1,2,4,1.7,,B,0.1\n3,4,1,1,1,,s0,,\n"
     (tmp_path / "t.csv").write_text("a,b,x,y,z,d,spot,who,sd\n" + rows)
     wire = ReadingColumns("distance", ("d",), "who", std=("sd",))

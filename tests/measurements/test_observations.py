@@ -19,7 +19,6 @@ Tables = dict[str, Any]
 
 
 def tables() -> Tables:
-    """Four or five rows of each kind at distinct configurations."""
     q = [some(5, seed=seed).q for seed in range(10, 16)]
     return {
         "position": dc.Measurements(q[0], values(5, 3), NAMES),
@@ -61,7 +60,6 @@ def test_parts_and_selections_keep_their_order(whole: Observations) -> None:
 
 
 def test_what_is_held_out(whole: Observations) -> None:
-    """Positions, or else whole places."""
     train, test = whole.split(0.5, seed=1)
     assert len(train) + len(test) == len(whole)
     assert "socket" not in test.kinds
@@ -145,7 +143,6 @@ def test_deviations_of_readings() -> None:
 
 
 def test_positions_beside_images_are_readings_with_their_deviations() -> None:
-    """Of every marker; poses stay poses."""
     data = some(4, markers=2)
     known = dc.Measurements(data.q, data.points, std=torch.linspace(1e-5, 8e-5, 8, dtype=torch.float64).view(4, 2))
     found = known.beside_images()

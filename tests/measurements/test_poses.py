@@ -36,7 +36,6 @@ EYE = torch.eye(3, dtype=torch.float64)
 
 
 def turn(axis: str, angle: float) -> np.ndarray:
-    """A turn about x, y or z, written out."""
     c, s = math.cos(angle), math.sin(angle)
     rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
     return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
@@ -129,7 +128,6 @@ def test_points_are_an_equilateral_triangle_around_the_origin_and_lead_back(leve
 
 
 def test_the_pose_of_bent_points_is_the_nearest() -> None:
-    """Against SciPy's best rotation."""
     lever, poses = 0.1, random_poses(30)
     points = mark_points(poses, lever) + 1e-2 * torch.from_numpy(np.random.default_rng(5).normal(size=(30, 3, 3)))
     found = poses_from_marks(points, lever)

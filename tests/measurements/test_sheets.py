@@ -88,7 +88,6 @@ NOTES = {
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str) -> None:
-    """Whatever the separator; what was decided is said."""
     name, write, joints, places = WRITERS[kind]
     write(tmp_path / name)
     for sep in ",;":

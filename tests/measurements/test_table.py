@@ -24,7 +24,6 @@ from diffeo_calib.measurements.table_format import LEVER
 
 
 def test_what_a_table_holds() -> None:
-    """Detached copies in double precision; poses with the points that represent them."""
     q = torch.tensor([[0.5, 1.0]], dtype=torch.float32, requires_grad=True)
     points = np.array([[1, 2, 3]])
     data = Measurements(q, points, joint_names=["a", "b"], marker_names=["tip"])
@@ -190,7 +189,6 @@ GONE = [(0, 1), (2, 0), (2, 2)]
 
 
 def frames_on_tips() -> Measurements:
-    """Poses on three tips, with standard deviations."""
     rng = np.random.default_rng(3)
     poses = random_poses(3 * ROWS, seed=5).unflatten(0, (ROWS, 3))
     std, turns = (rng.uniform(1e-5, 1e-3, (ROWS, 3, 3)) for _ in range(2))
@@ -201,7 +199,6 @@ def frames_on_tips() -> Measurements:
 
 
 def test_frames_are_tables_of_one_frame_side_by_side() -> None:
-    """Also in another measuring frame."""
     data, T = frames_on_tips(), random_poses(ROWS, seed=8)
     covariance, moved = held(data.covariance), data.in_frames(T)
     for frame in range(3):

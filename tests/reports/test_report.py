@@ -43,7 +43,6 @@ def made(path: Path, model: dc.CalibratedKinematics, data: dc.Measurements | Non
 
 
 def check_page(text: str) -> None:
-    """Sound HTML that loads nothing."""
     page = html.fromstring(text)
     sections = [section.get("id") for section in page.iter("section")]
     assert [name for name in sections if name != "devices"] == SECTIONS  # sessions have devices
@@ -156,7 +155,6 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command)
 
 
 def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case) -> None:
-    """Options that do not go together, tolerances that are none, and rows of another kind; no page is written."""
     (model, table), out, old = files, tmp_path / "report.html", tmp_path / "old.csv"
     fitted = arm.train[:30].with_joint_names(arm.robot.joint_names)
     write_measurements(old, fitted, TableFormat("mm", "deg"), position=("x", "y", "z"))

@@ -14,7 +14,6 @@ from diffeo_calib.robots.tree import robot_from_config
 
 
 def turns(vectors: Tensor) -> Tensor:
-    """(N, 3, 3) of rotation vectors (N, 3), rad."""
     return torch.from_numpy(Rotation.from_rotvec(vectors.numpy()).as_matrix())
 
 

@@ -224,7 +224,6 @@ def test_what_is_read_without_a_word(content: str | bytes, tmp_path: Path) -> No
 
 
 def test_joints_off_the_path_and_defaults(tmp_path: Path) -> None:
-    """Off the path they may be of any kind."""
     side = '<link name="finger"/><link name="thumb"/><link name="cloud"/><link name="cart"/>'
     side += joint("grip", "tool", "finger", "revolute")
     side += joint("follow", "tool", "thumb", "revolute", '<axis xyz="1 0 0"/><mimic joint="grip" multiplier="-1"/>')
@@ -263,7 +262,6 @@ def test_harmless_faults_are_ignored_with_a_warning(content: str, message: str, 
 
 
 def one(kind: str = "revolute", inside: str = Z) -> str:
-    """A robot of one joint."""
     return robot(joint("j", "base_link", "tool", kind, inside))
 
 

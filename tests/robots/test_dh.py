@@ -19,7 +19,6 @@ from diffeo_calib.robots.tree import robot_from_config
 
 
 def moved(axis: str, angle: float, *shift: float) -> torch.Tensor:
-    """A shift, then a turn about an axis."""
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.from_numpy(Rotation.from_euler(axis, angle).as_matrix())
     matrix[:3, 3] = torch.tensor(shift or (0.0, 0.0, 0.0), dtype=torch.float64)
@@ -28,7 +27,6 @@ def moved(axis: str, angle: float, *shift: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("convention", ["standard", "craig"])
 def test_table_multiplies_out_as_the_convention_says(convention: str) -> None:
-    """Hayati's twist comes after alpha."""
     rows = [DHRow(0.1, 0.4, 0.3, 0.2, beta=0.5), DHRow(-0.2, -1.1, 0.5, 0.7, "prismatic"), DHRow(0.3, 0.9, -0.1)]
     chain = from_dh(rows, convention)
     q = torch.tensor([[0.3, -0.4, 1.2]], dtype=torch.float64)

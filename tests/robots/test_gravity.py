@@ -18,13 +18,11 @@ from diffeo_calib.runtime.chain import Compliance
 
 
 def origins(chain: Chain, q: Tensor) -> Tensor:
-    """Origins of all frames, the tip last: (N, n_all + 1, 3)."""
     frames, tip = chain.joint_frames(q), chain(q)
     return torch.cat([frames[..., :3, 3], tip[:, None, :3, 3]], dim=1)
 
 
 def columns(sag: GravitySag, compliance: Compliance) -> Tensor:
-    """(K,) True for the coefficients of one compliance."""
     return torch.cat([torch.full((other.size,), other is compliance) for other in sag.compliances])
 
 

@@ -70,7 +70,6 @@ def test_noise_and_wrong_options() -> None:
 
 
 def test_transmission_errors_of_one_joint_each() -> None:
-    """They are periodic, and grow by wear."""
     arm = SimulatedArm()
     q = arm.sample(20)
     error = arm.components(q).transmission
