@@ -128,23 +128,17 @@ def imports() -> dict[str, list[tuple[str, int]]]:
 MODULES = [name for name in SOURCES if floor(name)]
 
 
-def test_every_folder_has_its_place() -> None:
+def test_every_folder_has_its_place_and_every_exception_is_needed() -> None:
     rooms = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"}
     assert rooms == {name.split(".")[0] for name in LEVEL}
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == IN_THE_ROOT
-
-
-def test_every_exception_is_needed() -> None:
     for module, other in EXCEPTIONS:
         assert f"{PACKAGE.name}.{other}" in [name for name, _ in imports()[f"{PACKAGE.name}.{module}"]]
 
 
-def test_imports_only_from_floors_below() -> None:
+def test_imports_only_from_floors_below_and_in_no_circle() -> None:
     found = [f"{module}, {text}" for module in MODULES for text in floor_mistakes(module, imports()[module])]
     assert not found, "\n".join(found)
-
-
-def test_no_import_cycles() -> None:
     graph = {module: {other for other, _ in found} for module, found in imports().items()}
     for module, other in EXCEPTIONS:  # inside functions
         graph[f"{PACKAGE.name}.{module}"].discard(f"{PACKAGE.name}.{other}")
@@ -169,12 +163,9 @@ def test_says_what_it_is_and_neither_prints_nor_asserts() -> None:
     assert not found, "\n".join(found)
 
 
-def test_files_of_tests_have_names_of_their_own() -> None:
+def test_files_of_tests_and_public_names() -> None:
     names = Counter(path.name for path in (PACKAGE.parent / "tests").rglob("test_*.py"))
     assert [name for name, count in names.items() if count > 1] == []
-
-
-def test_few_public_names() -> None:
     names = getattr(diffeo_calib, "__all__", [])
     assert len(names) <= MOST_PUBLIC_NAMES
     assert len(set(names)) == len(names)

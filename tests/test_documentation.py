@@ -40,14 +40,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_the_readme_is_a_front_door() -> None:
+def test_the_readme_is_a_front_door_and_links_lead_somewhere() -> None:
     text = README.read_text(encoding="utf-8")
     assert text.count("\n") <= MOST_LINES
     assert len(snippets(text)) == 2
     assert len(commands(text)) == 4
-
-
-def test_every_page_is_in_the_site_and_links_lead_somewhere() -> None:
     assert {path for path in TEXTS if path.is_file()} == {README, *PAGES.rglob("*.md")}
     made, benchmarks = {"commands.md", "benchmarks.md"}, (ROOT / "benchmarks/README.md").read_text(encoding="utf-8")
     headings = {re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in benchmarks.splitlines()}

@@ -34,16 +34,13 @@ def pose_errors(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return torch.cat([(found - truth)[:, :3, 3], torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)], 1)
 
 
-def test_derivatives_of_pixels() -> None:
+def test_derivatives_of_pixels_and_those_of_opencv() -> None:
     lens = CAMERA.lens
     points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64)
     by_point, by_lens = project_slopes(points, lens)
     full: Any = jacobian(lambda p: project(p, lens), points)
     assert_close(by_point, torch.stack([full[i, :, i] for i in range(3)]), rtol=0, atol=1e-9)
     assert_close(by_lens, jacobian(lambda own: project(points, own), lens), rtol=0, atol=1e-9)
-
-
-def test_opencv_projects_alike() -> None:
     cv2 = pytest.importorskip("cv2")
     points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4]], dtype=torch.float64)
     fx, fy, cx, cy, *distortion = CAMERA.lens.tolist()

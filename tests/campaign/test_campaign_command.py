@@ -58,7 +58,8 @@ def lines(tmp_path: Path) -> list[str]:
     return (tmp_path / "all.csv").read_text().splitlines(keepends=True)
 
 
-def test_one_process_writes_and_a_torn_line_is_removed(tmp_path: Path) -> None:
+def test_a_journal_is_whole_and_other_files_are_left_as_they_are(tmp_path: Path) -> None:
+    """One process writes, a torn line is removed. Others through links too, pipes, devices without an end, folders."""
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
         assert journal.entries == []
@@ -76,6 +77,18 @@ def test_one_process_writes_and_a_torn_line_is_removed(tmp_path: Path) -> None:
         with Journal(path) as journal:
             assert journal.entries == []
         assert path.read_bytes() == b""
+    path, link = tmp_path / "other", tmp_path / "run.csv.journal"
+    link.symlink_to(path)
+    for content in other_files():
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"not the journal of a campaign: got .*; name another table, or move"):
+            Journal(link)
+        assert path.read_bytes() == content
+    assert link.is_symlink()
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(InputError, match="not the journal"):
+            Journal(path)
 
 
 def other_files() -> Iterator[bytes]:
@@ -93,22 +106,6 @@ def other_files() -> Iterator[bytes]:
     lines += [{"rows": [ROW | field]} for field in [*fields, {"row": 0}]] + [{"rows": [{"fits": True}]}]
     for entry in [*({"row": 0} | own for own in rows + fields), *(line | own for own in lines)]:
         yield whole + as_line(entry)
-
-
-def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
-    """Also through a link; nor is a pipe, which was waited for, a device without an end, or a folder."""
-    path, link = tmp_path / "other", tmp_path / "run.csv.journal"
-    link.symlink_to(path)
-    for content in other_files():
-        path.write_bytes(content)
-        with pytest.raises(InputError, match=r"not the journal of a campaign: got .*; name another table, or move"):
-            Journal(link)
-        assert path.read_bytes() == content
-    assert link.is_symlink()
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
-        with pytest.raises(InputError, match="not the journal"):
-            Journal(path)
 
 
 def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,7 +137,15 @@ def test_a_target_at_the_origin_stays_and_one_without_numbers_is_named(tmp_path:
 
 
 @pytest.mark.usefixtures("model")
-def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
+def test_a_path_and_rows_that_miss(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
+    """Far targets and commands beyond the limits: the others are corrected, and the exit code is 0."""
+    output = program.with_name("c")
+    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
+    assert done.code == 0
+    names = list(model.robot.joint_names)
+    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
+    assert np.abs(change).max() <= 0.01 + 1e-9
+    assert any("the corrections of the path jump" in line for line in done.warnings)
     rows = read(program)
     names = [name for name in rows[0] if name not in ("line", "note")]
     rows[3][names[1]] = "900,0"
@@ -153,16 +161,6 @@ def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
     assert "and 2 more; see the column `status`" in done.out
     moved = table([after[0]], names) - table([rows[0]], names)
     assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
-
-
-def test_a_path(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
-    output = program.with_name("c")
-    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
-    assert done.code == 0
-    names = list(model.robot.joint_names)
-    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
-    assert np.abs(change).max() <= 0.01 + 1e-9
-    assert any("the corrections of the path jump" in line for line in done.warnings)
 
 
 def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -> None:

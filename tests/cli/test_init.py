@@ -136,7 +136,7 @@ def test_of_equal_series_the_robot_decides(proposed: Proposed, tmp_path: Path, c
     assert command("fit", tmp_path / "c.toml").code == 1
 
 
-def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -> None:
+def test_wished_places_and_names_that_contradict_the_numbers(proposed: Proposed) -> None:
     q, points = rows()
     nominal = 1e3 * ARM.nominal(q.deg2rad())[:, :3, 3]
     names = [f"m{k}_{axis}" for k in (1, 2) for axis in "xyz"]
@@ -148,6 +148,12 @@ def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -
     assert "m2_x, m2_y, m2_z: marker 1 is a copy of marker 0 (counted from 0); not used" in text
     _, text = proposed((SERIES, q), (["goal_x", "goal_y", "goal_z"], nominal))
     assert "got goal_x, goal_y, goal_z: wished places" in text
+    q, points = rows()
+    _, text = proposed(([f"{name} [rad]" for name in SERIES], q), (["x [mm]", "y [mm]", "z [mm]"], points))
+    assert "the units that the file states exclude others" in text
+    some = [f"{name}.pos" for k, name in enumerate(NAMES) if k != 3]
+    _, text = proposed((some, q[:, :5]), (XYZ, points))
+    assert f"No column is named after {NAMES[3]}" in text
 
 
 @pytest.mark.parametrize(
@@ -197,15 +203,6 @@ def test_poses_as_numbers_of_matrices_and_of_other_conventions(by_rows: bool, pr
     numbers = rotation_numbers(poses[:, :3, :3], name, angle=unit or "rad")
     written, _ = proposed((SERIES, q), (XYZ, poses[:, :3, 3]), (own, numbers))
     assert (written["rotation"], written["convention"], written.get("rotation-angle")) == (",".join(own), name, unit)
-
-
-def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -> None:
-    q, points = rows()
-    _, text = proposed(([f"{name} [rad]" for name in SERIES], q), (["x [mm]", "y [mm]", "z [mm]"], points))
-    assert "the units that the file states exclude others" in text
-    some = [f"{name}.pos" for k, name in enumerate(NAMES) if k != 3]
-    _, text = proposed((some, q[:, :5]), (XYZ, points))
-    assert f"No column is named after {NAMES[3]}" in text
 
 
 LIFT = """<robot name="lift"><link name="floor"/>

@@ -57,19 +57,16 @@ def test_later_tables_have_the_markers_of_the_model() -> None:
     assert as_at_the_fit(FIT, new) == replace(new, position=["x,y,z"], by="name")
 
 
-def test_init_finds_the_column_of_the_markers(files: Files, init: Any) -> None:
-    written, text = init(files.whole, files.urdf)
-    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in text
-    assert written["length"] == "mm"
-
-
-def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
+def test_init_joins_two_files_and_finds_the_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
     _, text = init(files.joints, files.urdf, "--places", files.places)
     assert 'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in text
     for words in ('places.csv"  # the measured', 'marker = "reflector"', 'length = "mm"', "# all columns are used"):
         assert words in text
     done = command("fit", tmp_path / "c.toml", "--position", "x")
     assert "--position: expected three names of columns" in done.error
+    written, text = init(files.whole, files.urdf)
+    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in text
+    assert written["length"] == "mm"
 
 
 @pytest.mark.parametrize(

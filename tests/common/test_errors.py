@@ -70,15 +70,12 @@ def test_scipy_stats_stays_away() -> None:
     assert done.returncode == 0
 
 
-def test_largest_known_value() -> None:
+def test_largest_known_values_and_bands() -> None:
     values = torch.tensor([[1.0, nan, 3.0], [nan, nan, nan], [-5.0, -7.0, nan], [inf, nan, 0.0]], dtype=torch.float64)
     expected = torch.tensor([3.0, nan, -5.0, inf], dtype=torch.float64)
     assert_close(largest_known(values), expected, rtol=0, atol=0, equal_nan=True)
     assert_close(largest_known(values.T, 0), expected, rtol=0, atol=0, equal_nan=True)
     assert known(values).tolist() == [1.0, 3.0, -5.0, -7.0, inf, 0.0]
-
-
-def test_successes_and_failures_have_mirrored_bands() -> None:
     assert binomial_band(10, 0.5, 0.05) == (2, 8)  # at most 1 of 10 coins: 11 of 1024
     for count, share in ((20, 0.95), (300, 0.9), (7, 0.3)):
         low, high = binomial_band(count, share, 0.01)

@@ -41,7 +41,8 @@ def flow_of(case: Case, integrator: Integrator, size: float = 0.3, *, variationa
 
 
 @every_case
-def test_energy_and_its_gradient(case: Case) -> None:
+def test_energy_velocity_and_their_gradients(case: Case) -> None:
+    """Closed-form backpropagation compared with autograd, for all inputs together and each alone."""
     q, a = start(case, 1.0).unbind(0)
     matrix = case.matrix(q, q)
     q, a = q.requires_grad_(), a.requires_grad_()
@@ -50,6 +51,14 @@ def test_energy_and_its_gradient(case: Case) -> None:
     actual = torch.autograd.grad(3.0 * value, (q, a))
     expected = torch.autograd.grad(3.0 * case.hamiltonian(q, a), (q, a), materialize_grads=True)
     torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
+    x, (q, a), c = case.points(N + 2, seed=1), start(case, 1.0).unbind(0), normal(N + 2, case.dim, seed=8)
+    for live in ((True, True, True), (True, False, False), (False, True, False), (False, False, True)):
+        inputs = [t.clone().requires_grad_(flag) for t, flag in zip((x, q, a), live, strict=True)]
+        wanted = [t for t in inputs if t.requires_grad]
+        actual, expected = velocity(case.kernel, *inputs), case.kernel.field(*inputs)
+        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
+        one, other = (torch.autograd.grad((c * value).sum(), wanted) for value in (actual, expected))
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 SMOOTH = [case for case in CASES if "1.5" not in case.name]
@@ -67,7 +76,7 @@ def test_energy_is_conserved_with_the_order_of_the_method(case: Case) -> None:
 
 
 @every_case
-def test_nodes_and_discrete_adjoint_are_those_of_the_naive_integration(case: Case) -> None:
+def test_nodes_adjoint_and_passive_points_are_those_of_the_naive_integration(case: Case) -> None:
     """Backpropagation through the steps, by the closed form of each, is the exact gradient of the discrete map."""
     state, weight = start(case, 0.6), normal(2, N, case.dim, seed=4)
     nodes = flow_of(case, RK4(3), 0.6).nodes
@@ -78,34 +87,17 @@ def test_nodes_and_discrete_adjoint_are_those_of_the_naive_integration(case: Cas
     for end in (nodes[-1], naive_rk4(case.geodesic_field, live, 2)[-1]):
         found.append(torch.autograd.grad((weight * end + 0.5 * end**2).sum(), live)[0])
     torch.testing.assert_close(*found, rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_velocity_and_its_gradients(case: Case) -> None:
-    x, (q, a), c = case.points(N + 2, seed=1), start(case, 1.0).unbind(0), normal(N + 2, case.dim, seed=8)
-    for live in ((True, True, True), (True, False, False), (False, True, False), (False, False, True)):
-        inputs = [t.clone().requires_grad_(flag) for t, flag in zip((x, q, a), live, strict=True)]
-        wanted = [t for t in inputs if t.requires_grad]
-        actual, expected = velocity(case.kernel, *inputs), case.kernel.field(*inputs)
-        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
-        one, other = (torch.autograd.grad((c * value).sum(), wanted) for value in (actual, expected))
-        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+    flow, x = flow_of(case, RK4(3)), case.points(M, seed=1)
+    q, a = flow.nodes[0]
+    state = torch.stack([torch.cat([q, x]), torch.cat([a, torch.zeros_like(x)])])
+    expected = naive_rk4(case.geodesic_field, state, 3)[-1][0, N:].detach()
+    torch.testing.assert_close(flow(x), expected, rtol=1e-13, atol=1e-13)
 
 
 def test_velocity_is_twice_differentiable() -> None:
     kernel = dc.Gaussian(0.8, 1.3) + dc.Matern(0.9, 3.5)
     inputs = [normal(*shape, seed=k).requires_grad_() for k, shape in enumerate(((3, 2), (2, 2), (2, 2)))]
     assert torch.autograd.gradgradcheck(lambda x, q, a: velocity(kernel, x, q, a), inputs)
-
-
-@every_case
-def test_passive_points_are_controls_without_momentum(case: Case) -> None:
-    """The naive geodesic of controls and of passive points with a = 0, together."""
-    flow, x = flow_of(case, RK4(3)), case.points(M, seed=1)
-    q, a = flow.nodes[0]
-    state = torch.stack([torch.cat([q, x]), torch.cat([a, torch.zeros_like(x)])])
-    expected = naive_rk4(case.geodesic_field, state, 3)[-1][0, N:].detach()
-    torch.testing.assert_close(flow(x), expected, rtol=1e-13, atol=1e-13)
 
 
 @every_case

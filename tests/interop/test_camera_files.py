@@ -125,7 +125,7 @@ def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     assert "expected one that saw a board, got none" in wrong.error
 
 
-def test_what_explains_the_errors_adds_up() -> None:
+def test_what_explains_the_errors_and_models_of_earlier_versions() -> None:
     own = camera_of(on_tool()).explained
     parts = [own.arm, own.lens, own.board, own.corners]
     assert abs(sum(part**2 for part in parts) ** 0.5 / own.nominal - 1) < 1e-9
@@ -134,9 +134,6 @@ def test_what_explains_the_errors_adds_up() -> None:
     assert 0 < own.board_std < own.corners
     lines = "\n".join(on_tool().placement[0].sentences())
     assert f"arm {1e3 * own.arm:.3f}" in lines
-
-
-def test_models_of_earlier_versions_have_lens_and_board_alone() -> None:
     placed = on_tool().placement[0]
     old = replace(placed, constants=camera_of(on_tool()).camera.unknowns[None])
     assert not old.cameras

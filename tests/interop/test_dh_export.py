@@ -197,7 +197,7 @@ def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_
         torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
 
 
-def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
+def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
     geometry = Geometry.nominal(load(tmp_path / "ur.urdf", urdf()))
     write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash="calib_4890363623803256388")
     assert read_yaml(tmp_path / "ur.yaml")[1] == "calib_4890363623803256388"
@@ -207,9 +207,6 @@ def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
     for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
         with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
             write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)
-
-
-def test_other_robots_are_refused(tmp_path: Path) -> None:
     new, path = tmp_path / "ur.yaml", tmp_path / "ur.urdf"
     with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
         write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)

@@ -46,11 +46,19 @@ def test_points_and_tool_poses_of_any_number_of_rows(name: str) -> None:
             same(found, model.tool_poses(q, tool, frame))
 
 
-def test_derivatives_of_a_program_at_control_points_too() -> None:
+def test_derivatives_plain_maps_and_single_precision() -> None:
+    """Derivatives at control points too; single precision is good to micrometres."""
     for name, transform in (("mimic slides", jacrev), ("one joint", jacfwd)):
         model = made(name)
         program, q = TorchProgram(model), queries(model)
         same(vmap(transform(lambda row, of=program: of(row[None])[0]))(q), model.jacobian(q), 1e-10)
+    model = fitted_plain("matern52")
+    same(TorchProgram(model)(queries(model)), model(queries(model)))
+    model = made("arm")
+    for output, expected in (("points", model), ("tool_poses", model.tool_poses)):
+        found = TorchProgram(model, output, dtype=torch.float32)(queries(model).float())
+        assert found.dtype == torch.float32
+        same(found.double(), expected(queries(model)), 5e-6)
 
 
 def test_a_pose_in_closed_form_is_that_of_least_squares() -> None:
@@ -63,19 +71,6 @@ def test_a_pose_in_closed_form_is_that_of_least_squares() -> None:
         found, expected = poses_of_triangles(bent), poses_from_marks(bent, lever)
         same(found, expected)
         assert float(angle_between(found[:, :3, :3], R).max()) > 0.05
-
-
-def test_plain_maps_are_recorded_as_they_are() -> None:
-    model = fitted_plain("matern52")
-    same(TorchProgram(model)(queries(model)), model(queries(model)))
-
-
-def test_single_precision_is_good_to_micrometres() -> None:
-    model = made("arm")
-    for output, expected in (("points", model), ("tool_poses", model.tool_poses)):
-        found = TorchProgram(model, output, dtype=torch.float32)(queries(model).float())
-        assert found.dtype == torch.float32
-        same(found.double(), expected(queries(model)), 5e-6)
 
 
 @pytest.mark.filterwarnings("ignore")  # torch's own: it deprecates this, and mentions constants

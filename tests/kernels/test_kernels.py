@@ -48,7 +48,7 @@ def test_points_and_momenta_of_other_shapes_are_refused() -> None:
 
 
 @every_case
-def test_matrix_is_the_textbook_formula_symmetric_and_positive_semi_definite(case: Case) -> None:
+def test_matrix_is_the_textbook_formula_periodic_symmetric_and_positive_semi_definite(case: Case) -> None:
     x, q, _ = data(case)
     torch.testing.assert_close(case.kernel.matrix(x, q), case.matrix(x, q), rtol=1e-13, atol=1e-13)
     x = torch.cat([case.points(20, seed=1), case.points(4, seed=1) + 1e-4])
@@ -57,10 +57,6 @@ def test_matrix_is_the_textbook_formula_symmetric_and_positive_semi_definite(cas
     assert float(torch.linalg.eigvalsh(matrix).min()) >= -1e-10
     y = case.points(N, seed=2)
     torch.testing.assert_close(case.kernel.matrix(x, y), case.kernel.matrix(y, x).T, rtol=0, atol=5e-15)
-
-
-@every_case
-def test_kernel_has_the_period_of_its_space(case: Case) -> None:
     x, q, a = data(case)
     turns = torch.round(3 * normal(M, case.dim, seed=4)) * 2 * torch.pi * torch.tensor(case.space.periodic)
     found, expected = (case.kernel.field_and_jacobian(at, q, a) for at in (x + turns, x))
@@ -68,7 +64,8 @@ def test_kernel_has_the_period_of_its_space(case: Case) -> None:
 
 
 @every_case
-def test_field_and_its_jacobian(case: Case) -> None:
+def test_field_its_jacobian_and_gradients(case: Case) -> None:
+    """Of H(q, a), and of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
     x, q, a = data(case)
     v, dv = case.kernel.field_and_jacobian(x, q, a)
     torch.testing.assert_close(v, case.velocity(x, q, a), rtol=1e-13, atol=1e-13)
@@ -76,11 +73,6 @@ def test_field_and_its_jacobian(case: Case) -> None:
     torch.testing.assert_close(dv, naive, rtol=1e-12, atol=1e-12)
     own = rows_jacobian(lambda at: case.kernel.field(at, q, a), x)
     torch.testing.assert_close(own, naive, rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_gradients_with_themselves_and_between_two_sets_of_points(case: Case) -> None:
-    """Of H(q, a), and of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
     x, q, a = data(case)
     live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
     slope, velocity = torch.autograd.grad(case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True)
@@ -91,8 +83,8 @@ def test_gradients_with_themselves_and_between_two_sets_of_points(case: Case) ->
 
 
 @every_case
-def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
-    """Double autograd of the pairs i != j; the diagonal's Hessian in q is zero."""
+def test_hessian_product_and_coinciding_points(case: Case) -> None:
+    """Double autograd of the pairs i != j. Two coinciding controls act like one with the sum of their momenta."""
     _, q, a = data(case)
     dq, da = normal(N, case.dim, seed=6), normal(N, case.dim, seed=7)
     live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
@@ -101,11 +93,6 @@ def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
     dv, dg = case.kernel.hessian_product(q, a, dq, da)
     torch.testing.assert_close(dv, expected_a, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(dg, expected_q, rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_coinciding_points_do_no_harm(case: Case) -> None:
-    """Two coinciding controls act like one control with the sum of their momenta."""
     _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
@@ -183,7 +170,7 @@ def test_kernels_of_another_dimension_are_refused(kernel: Kernel, dim: int) -> N
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_at_zero_values_are_one_and_all_is_finite(name: str) -> None:
+def test_profiles_at_zero_and_beyond_their_derivatives(name: str) -> None:
     """And the slope is that of 1 - nu / (2 (nu - 1)) r2 + ..., of a Matern kernel."""
     profile, r2 = PROFILES[name], tensor([0.0, 1e-300, 1e-17, 1e-16]).requires_grad_()
     assert float(profile.derivative(tensor(0.0), 0)) == 1.0
@@ -193,10 +180,6 @@ def test_at_zero_values_are_one_and_all_is_finite(name: str) -> None:
         assert bool(torch.isfinite(value).all())
     if (nu := getattr(profile, "nu", None)) is not None:
         assert float(first[0]) == pytest.approx(-nu / (2 * (nu - 1)), rel=1e-15)
-
-
-@pytest.mark.parametrize("name", PROFILES)
-def test_differentiating_too_often_is_refused(name: str) -> None:
     if isinstance(PROFILES[name], GaussianProfile):
         return  # one exponential, which autograd follows as often as it likes
     r2 = tensor([0.5]).requires_grad_()

@@ -116,12 +116,7 @@ def test_recordings_with_clocks_of_their_own(offset: float, rate: float, tmp_pat
     assert abs(float(words[1]) - offset) < 0.03
 
 
-def test_the_noise_of_a_recording_is_that_of_its_values() -> None:
-    values = 3.0 + 0.2 * np.random.default_rng(0).normal(size=(20_000, 2))
-    assert Recording(np.arange(20_000.0), values).noise == pytest.approx(0.2, rel=0.03)
-
-
-def test_stops_and_the_offset_are_found() -> None:
+def test_stops_the_offset_noise_and_images_are_found() -> None:
     found, offset = stops(*recordings())
     assert offset == pytest.approx(OFFSET_S, abs=0.03)
     assert len(found) == len(stops(*recordings(), offset=OFFSET_S)[0]) == STOPS
@@ -131,6 +126,15 @@ def test_stops_and_the_offset_are_found() -> None:
         np.testing.assert_allclose(one.seen, place(one.joints[None])[0], rtol=0, atol=1e-4)
         assert np.all((one.deviations > 0.6 * NOISE_M) & (one.deviations < 1.6 * NOISE_M))
         assert one.count > 100
+    joints, _ = recordings()
+    middles = np.arange(STOPS) * (STAND_S + MOVE_S) + 0.5 * STAND_S
+    times = np.concatenate([middles[1:] + 0.1, middles[1:] - 0.2, middles + 0.5 * (STAND_S + MOVE_S), [0.02]])
+    found, without = pictured(joints, times - 3.0, offset=3.0)
+    assert [time for _, time in found] == pytest.approx(list(middles[1:] + 0.1 - 3.0))
+    assert without == 1
+    np.testing.assert_allclose([q for q, _ in found], angle(middles[1:]), rtol=0, atol=5e-4)
+    values = 3.0 + 0.2 * np.random.default_rng(0).normal(size=(20_000, 2))
+    assert Recording(np.arange(20_000.0), values).noise == pytest.approx(0.2, rel=0.03)
 
 
 def test_recordings_without_stops_or_common_times_are_refused() -> None:
@@ -146,13 +150,3 @@ def test_recordings_without_stops_or_common_times_are_refused() -> None:
     ):
         with pytest.raises(MeasurementError, match=message):
             call()
-
-
-def test_each_stop_takes_the_image_nearest_to_its_middle() -> None:
-    joints, _ = recordings()
-    middles = np.arange(STOPS) * (STAND_S + MOVE_S) + 0.5 * STAND_S
-    times = np.concatenate([middles[1:] + 0.1, middles[1:] - 0.2, middles + 0.5 * (STAND_S + MOVE_S), [0.02]])
-    found, without = pictured(joints, times - 3.0, offset=3.0)
-    assert [time for _, time in found] == pytest.approx(list(middles[1:] + 0.1 - 3.0))
-    assert without == 1
-    np.testing.assert_allclose([q for q, _ in found], angle(middles[1:]), rtol=0, atol=5e-4)

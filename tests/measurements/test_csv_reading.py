@@ -188,12 +188,20 @@ def test_unlikely_units_cause_a_warning(row: str, how: dict[str, Any], message: 
     assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
 
 
-def test_likely_units_cause_no_warning(read: Reader) -> None:
+def test_likely_units_and_angles_in_minutes(read: Reader) -> None:
     read(HEADER + "90,0.1,1000,0,500\n", kinds=["prismatic", "revolute"], length="mm")
     header, row = HEADER.rstrip() + ",a,b,c,d\n", "0,1,1,2,3,0,{},0,1"
     read(header + row.format(0), **POSED)
     read(header + row.format(6.2832), **POSED | {"rotation_angle": "rad"})
     read(header + row.format(0), rotation=["a", "b", "c", "d"], convention="quat_xyzw")  # quaternions have no unit
+    text = "q1;q2;sd;hz;v\n0;0;2;270°;90°\n0;1;2;0°0'0\";0\n1;1;2;45° 30' 36,0\";120°\n"
+    how: dict[str, Any] = {"sep": ";", "decimal": ",", "spherical": "zenith_clockwise_deg"}
+    data = read(text, JOINTS, ["sd", "hz", "v"], length="m", angle="rad", **how)
+    turn, up = math.radians(-45.51), math.radians(-30.0)
+    last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
+    assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
+    assert "--position zenith_clockwise_deg=sd,hz,v" in data.origin.options
+    assert "--spherical" not in data.origin.options
 
 
 def test_joints_alone_and_records(tmp_path: Path) -> None:
@@ -259,17 +267,6 @@ def test_lines_without_joint_values_or_markers(read: Reader) -> None:
     with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 3"):
         data = read(PAIR + "0.1,0.2,1,2,3,4,5,6\n0.3,0.4,,,,4,5,6\n", position=TWO[0])  # of a single marker
     assert data.line_numbers.tolist() == [2]
-
-
-def test_angles_in_minutes_and_places_as_angles(read: Reader) -> None:
-    text = "q1;q2;sd;hz;v\n0;0;2;270°;90°\n0;1;2;0°0'0\";0\n1;1;2;45° 30' 36,0\";120°\n"
-    how: dict[str, Any] = {"sep": ";", "decimal": ",", "spherical": "zenith_clockwise_deg"}
-    data = read(text, JOINTS, ["sd", "hz", "v"], length="m", angle="rad", **how)
-    turn, up = math.radians(-45.51), math.radians(-30.0)
-    last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
-    assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
-    assert "--position zenith_clockwise_deg=sd,hz,v" in data.origin.options
-    assert "--spherical" not in data.origin.options
 
 
 def lost(*rows: int, mark: str = "0") -> str:

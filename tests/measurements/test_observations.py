@@ -128,7 +128,7 @@ def test_tables_that_cannot_be_joined(change: Callable[[Tables], list[dc.Measure
         Observations.joined(change(tables()))
 
 
-def test_deviations_of_readings() -> None:
+def test_deviations_of_readings_and_positions_beside_images() -> None:
     q = values(3, 2)
     assert held(Readings.distances(q, 1.0, std=[1.0, 2.0, 3.0]).std)[:, 0].tolist() == [1.0, 2.0, 3.0]
     seen = Readings.images(q, values(3, 2), focal=(10.0, 20.0), centre=(1.0, 2.0), std=0.2)
@@ -140,9 +140,6 @@ def test_deviations_of_readings() -> None:
             Readings.heights(q, std=std)
     with pytest.raises(MeasurementError, match=r"pass 2 per row\W*$"):  # pixels, no metres
         Readings.images(q, values(3, 3), focal=(10.0, 20.0), centre=(1.0, 2.0))
-
-
-def test_positions_beside_images_are_readings_with_their_deviations() -> None:
     data = some(4, markers=2)
     known = dc.Measurements(data.q, data.points, std=torch.linspace(1e-5, 8e-5, 8, dtype=torch.float64).view(4, 2))
     found = known.beside_images()

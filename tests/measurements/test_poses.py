@@ -127,17 +127,6 @@ def test_points_are_an_equilateral_triangle_around_the_origin_and_lead_back(leve
     assert_close(poses_from_marks(points, lever), poses, rtol=0, atol=1e-14 * max(1.0, 1 / lever))
 
 
-def test_the_pose_of_bent_points_is_the_nearest() -> None:
-    lever, poses = 0.1, random_poses(30)
-    points = mark_points(poses, lever) + 1e-2 * torch.from_numpy(np.random.default_rng(5).normal(size=(30, 3, 3)))
-    found = poses_from_marks(points, lever)
-    assert_close(found[:, :3, 3], points.mean(1), rtol=0, atol=1e-15)
-    for row in range(30):
-        centred = (points[row] - points[row].mean(0)).numpy()
-        best = Rotation.align_vectors(centred, marks(HOST).numpy())[0]
-        assert_close(found[row, :3, :3], torch.from_numpy(best.as_matrix()), rtol=0, atol=1e-7)
-
-
 def test_points_without_orientation_and_levers_without_length_are_refused() -> None:
     points = mark_points(random_poses(3), 0.1)
     points[1] = torch.tensor([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], dtype=torch.float64)
@@ -154,11 +143,19 @@ def test_points_without_orientation_and_levers_without_length_are_refused() -> N
                 use(given, lever)  # pyright: ignore[reportArgumentType]
 
 
-def test_rounded_transforms_become_rigid() -> None:
+def test_rounded_transforms_and_bent_points() -> None:
     poses = random_poses(20)
     found = rigid_poses(poses.numpy().round(5).tolist())
     assert_close(found, poses, rtol=0, atol=2e-5)
     assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
+    lever, poses = 0.1, random_poses(30)
+    points = mark_points(poses, lever) + 1e-2 * torch.from_numpy(np.random.default_rng(5).normal(size=(30, 3, 3)))
+    found = poses_from_marks(points, lever)
+    assert_close(found[:, :3, 3], points.mean(1), rtol=0, atol=1e-15)
+    for row in range(30):
+        centred = (points[row] - points[row].mean(0)).numpy()
+        best = Rotation.align_vectors(centred, marks(HOST).numpy())[0]
+        assert_close(found[row, :3, :3], torch.from_numpy(best.as_matrix()), rtol=0, atol=1e-7)
 
 
 ROWS, STEP = 6, 1e-6

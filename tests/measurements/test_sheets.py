@@ -106,7 +106,7 @@ def test_lengths_in_every_unit(length: str, metres: float, tmp_path: Path) -> No
     torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES))
 
 
-def test_lines_and_columns(tmp_path: Path) -> None:
+def test_lines_columns_and_a_missing_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever size the file says that the sheet has: some programs write that of one cell."""
     _book(tmp_path / "t.xlsx")
     with ZipFile(tmp_path / "t.xlsx") as book, ZipFile(tmp_path / "one.xlsx", "w") as other:
@@ -121,6 +121,10 @@ def test_lines_and_columns(tmp_path: Path) -> None:
     (_, first), *_ = file.rows()
     assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
+    _book(tmp_path / "t.xlsx")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(MeasurementError, match=r"pip install 'diffeo_calib\[excel\]'"):
+        read_measurements(tmp_path / "t.xlsx", ["q_1", "q_2"], ["p_x", "p_y", "p_z"], **UNITS)
 
 
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
@@ -143,10 +147,3 @@ def test_other_files_are_one_clear_error(tmp_path: Path, kind: str) -> None:
         read_measurements(tmp_path / name, ["1", "2"], ["3", "4", "5"], **UNITS)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_reader_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _book(tmp_path / "t.xlsx")
-    monkeypatch.setitem(sys.modules, "openpyxl", None)
-    with pytest.raises(MeasurementError, match=r"pip install 'diffeo_calib\[excel\]'"):
-        read_measurements(tmp_path / "t.xlsx", ["q_1", "q_2"], ["p_x", "p_y", "p_z"], **UNITS)

@@ -134,7 +134,7 @@ def test_set_ups_and_loads_of_rows() -> None:
             call()
 
 
-def test_rows() -> None:
+def test_rows_and_groups() -> None:
     data = some(5)
     for index, expected in [
         (2, [2]),
@@ -152,6 +152,11 @@ def test_rows() -> None:
     for outside in (5, [0, 9], [True, False]):
         with pytest.raises(IndexError):
             data[outside]
+    step = 0.9 * REPEAT_TOLERANCE
+    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
+    data = Measurements(q, np.arange(15.0).reshape(5, 3))
+    assert data.groups().tolist() == [0, 1, 1, 2, 3]
+    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (4, 2), (4, 2, 3)])
@@ -266,14 +271,6 @@ def test_parts_carry_poses_and_known_noise(kind: str) -> None:
     assert (renamed.joint_names, data.joint_names) == (("c", "d"), ("a", "b"))
     with pytest.raises(MeasurementError, match=r"`names`.*expected 2.*got 1"):
         data.with_joint_names(["c"])
-
-
-def test_groups_gather_around_their_first_row_and_do_not_chain() -> None:
-    step = 0.9 * REPEAT_TOLERANCE
-    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
-    data = Measurements(q, np.arange(15.0).reshape(5, 3))
-    assert data.groups().tolist() == [0, 1, 1, 2, 3]
-    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
 
 
 @st.composite

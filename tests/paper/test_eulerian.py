@@ -85,7 +85,8 @@ def test_17_and_19_against_loops(equations: Eulerian) -> None:
     assert float((run.nodes[-1] - run.nodes[0]).abs().amax(0).min()) > 5e-4  # everything has moved
 
 
-def test_16_against_loops() -> None:
+def test_16_against_loops_and_several_markers() -> None:
+    """Two markers of one configuration are two landmarks of w: against the field of all marker points."""
     problem = EulerianProblem(small_problem())
     deformation = problem.deform(momenta(P0), dc.RK4(2))
     parts = problem.energy(deformation)
@@ -99,6 +100,15 @@ def test_16_against_loops() -> None:
     assert float(parts.field_y) == pytest.approx(task, rel=1e-12)
     assert float(parts.data) == pytest.approx(data, rel=1e-12)
     assert float(parts.total) == pytest.approx(joint + task + data, rel=1e-12)
+    problem, p0 = two_marker_problem(uniform(5, 2, seed=2)), 0.05 * normal(10, 2, seed=3)
+    flow = EulerianProblem(problem).deform(momenta(p0), dc.RK4(1))
+    z = planar_two_markers(problem.x).reshape(10, 2)
+    jacobian = as_nominal(planar_two_markers).jacobian(problem.x, torch.zeros(0))
+    a = -torch.einsum("imn,im->in", jacobian, p0.reshape(5, 4))
+    v, w = problem.spec.joint_kernel.field(problem.x, problem.x, a), problem.spec.task_kernel.field(z, z, p0)
+    rate = flow.unpack(flow.rates(flow.nodes[0]))[0]
+    expected = w.reshape(5, 4) - torch.einsum("imn,in->im", jacobian, v)
+    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -137,19 +147,6 @@ def test_gradient_against_finite_differences(equations: Eulerian, integrator: In
     direction, h = normal(7, 2, seed=6), 1e-5
     difference = float(energy(P0 + h * direction) - energy(P0 - h * direction)) / (2 * h)
     assert float((found[1] * direction).sum()) == pytest.approx(difference, rel=tolerance)
-
-
-def test_several_markers_move_in_one_field() -> None:
-    """Two markers of one configuration are two landmarks of w: against the field of all marker points."""
-    problem, p0 = two_marker_problem(uniform(5, 2, seed=2)), 0.05 * normal(10, 2, seed=3)
-    flow = EulerianProblem(problem).deform(momenta(p0), dc.RK4(1))
-    z = planar_two_markers(problem.x).reshape(10, 2)
-    jacobian = as_nominal(planar_two_markers).jacobian(problem.x, torch.zeros(0))
-    a = -torch.einsum("imn,im->in", jacobian, p0.reshape(5, 4))
-    v, w = problem.spec.joint_kernel.field(problem.x, problem.x, a), problem.spec.task_kernel.field(z, z, p0)
-    rate = flow.unpack(flow.rates(flow.nodes[0]))[0]
-    expected = w.reshape(5, 4) - torch.einsum("imn,in->im", jacobian, v)
-    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
 
 
 def test_a_fit_of_an_easy_problem_and_overflow(tmp_path: Path) -> None:

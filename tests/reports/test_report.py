@@ -264,7 +264,7 @@ def test_a_fit_from_the_model_alone(arm: Case, monkeypatch: pytest.MonkeyPatch) 
     assert blocks.left_out[0].norm() > errors.norm()
 
 
-def test_a_forecast_follows_a_power_law_above_the_limit() -> None:
+def test_forecasts_and_shares_of_a_perfect_model(arm: Case) -> None:
     limit = 2e-5
     curve = [(n, ((3e-3 / n) ** 2 + limit**2) ** 0.5) for n in (25, 50, 100, 200)]
     found = forecast(curve, limit)
@@ -275,9 +275,6 @@ def test_a_forecast_follows_a_power_law_above_the_limit() -> None:
     assert forecast([(10, 1e-3), (20, 1.1e-3), (40, 1.2e-3)], limit) is None  # no improvement
     assert forecast(curve[:2], limit) is None  # too short
     assert forecast(curve, 1.0) is None  # below its limit
-
-
-def test_found_shares_of_a_perfect_model_are_the_claimed_ones(arm: Case) -> None:
     seen = Predictions.of(arm.model, arm.test)
     factor = torch.linalg.cholesky(seen.covariance)
     draws = torch.randn(seen.away.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -339,7 +336,7 @@ def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.F
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_wrong_rows_are_named_and_not_praised(arm: Case) -> None:
+def test_wrong_rows_are_named_and_those_of_the_fit_left_out(arm: Case) -> None:
     test = arm.test[:60]
     noise = torch.randn(test.points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
@@ -358,10 +355,6 @@ def test_wrong_rows_are_named_and_not_praised(arm: Case) -> None:
     assert found.moved == []
     turned = find(arm.model, dc.Measurements(test.q, test.points + torch.tensor([0.003, 0.0, 0.0])))
     assert any("measuring device" in text for text in turned.moved)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_rows_of_the_fit_and_of_a_registration_are_left_out_of_new_rows(arm: Case) -> None:
     test = arm.test[:60]
     found, same = find(arm.model, dc.Measurements.joined([arm.train, test])), find(arm.model, arm.train)
     assert (found.new, same.new) == (True, False)
@@ -371,10 +364,6 @@ def test_rows_of_the_fit_and_of_a_registration_are_left_out_of_new_rows(arm: Cas
     registered = arm.model.registered(shifted[:12])
     assert len(find(registered, shifted).predictions) == len(shifted) - 12
     assert not find(registered, shifted[:12]).new
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_bad_arguments_are_input_errors(arm: Case) -> None:
     refused(
         ("calibrated model", lambda: find(arm.robot)),  # pyright: ignore[reportArgumentType]
         (r"dc\.Measurements", lambda: find(arm.model, arm.test.q)),

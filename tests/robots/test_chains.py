@@ -25,7 +25,7 @@ def crooked(tmp_path: Path) -> Chain:
     return load_urdf(tmp_path / "robot.urdf", "world", "end")
 
 
-def test_attributes_and_forms_of_values(crooked: Chain) -> None:
+def test_attributes_forms_of_values_and_reach(crooked: Chain) -> None:
     assert crooked.joint_names == ("slide", "turn", "spin", "lift")
     assert crooked.kinds == ("prismatic", "revolute", "continuous", "prismatic")
     assert crooked.periodic == (False, True, True, False)
@@ -38,9 +38,6 @@ def test_attributes_and_forms_of_values(crooked: Chain) -> None:
     assert crooked(q.float()).dtype == torch.float64
     assert crooked(q[:0]).shape == (0, 4, 4)
     assert crooked.jacobian(q[:0]).shape == (0, 6, 4)
-
-
-def test_reach_bounds_the_distance_and_is_not_wasteful(crooked: Chain) -> None:
     arm = SimulatedArm()
     distances = arm.nominal(arm.sample(3000))[:, :3, 3].norm(dim=1)
     assert distances.max() < arm.nominal.reach < 1.3 * distances.max()

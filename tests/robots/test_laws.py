@@ -124,15 +124,6 @@ def test_a_reversed_chain_has_inverse_poses(chain: dc.Chain) -> None:
     assert_close(again(reordered(q, chain, again)), chain(q), rtol=0, atol=1e-13)
 
 
-@every_robot
-def test_descriptions_come_back(robot: Tree) -> None:
-    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
-    assert type(again) is type(robot)
-    assert repr(again) == repr(robot)
-    q = draw(4, robot.n)
-    assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("tips", "loads", "message"),
     [
@@ -149,13 +140,18 @@ def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: st
 
 
 @every_robot
-def test_jacobians_are_derivatives(robot: Tree) -> None:
+def test_jacobians_are_derivatives_and_descriptions_come_back(robot: Tree) -> None:
     q = draw(3, robot.n)
     slopes = vmap(jacfwd(lambda row: robot.tip_poses(row[None])[0]))(q)  # (N, tips, 4, 4, n)
     found = robot.jacobian(q).view(3, len(robot.tips), 6, robot.n)
     assert_close(found[:, :, :3], slopes[..., :3, 3, :], rtol=0, atol=1e-13)
     spin = torch.einsum("ntabj,ntcb->ntjac", slopes[..., :3, :3, :], robot.tip_poses(q)[..., :3, :3])
     assert_close(skew(found[:, :, 3:].mT), spin, rtol=0, atol=1e-13)
+    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
+    assert type(again) is type(robot)
+    assert repr(again) == repr(robot)
+    q = draw(4, robot.n)
+    assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
 
 
 def laden(robot: Tree) -> GeometryMap:
