@@ -17,19 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import product_bank
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
-from product_bank import (
-    Case,
-    calibrated,
-    calibrated_poses,
-    sliding_measurements,
-    sliding_robot,
-    ur10_measurements,
-    usual_scales,
-    with_usual_scales,
-)
+from product_bank import Case, calibrated, ur10_measurements, usual_scales, with_usual_scales
 from shared_bank import begin, shared
 
 import diffeo_calib as dc
@@ -52,14 +44,14 @@ def pair() -> Case:
 @pytest.fixture(scope="session")
 def posed() -> Case:
     """The simulated arm, calibrated with 30 poses of a frame on its tool."""
-    return shared("posed", lambda: calibrated_poses(30))
+    return shared("posed", lambda: product_bank.calibrated_poses(30))
 
 
 @pytest.fixture(scope="session")
 def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
-    robot = sliding_robot()
-    train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
+    robot = product_bank.sliding_robot()
+    train, test = product_bank.sliding_measurements(robot, 50), product_bank.sliding_measurements(robot, 300, seed=1)
     scales = usual_scales(robot).inflated(2.0)
     return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
 

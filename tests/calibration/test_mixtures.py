@@ -16,12 +16,7 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import (
-    KindRows,
-    Rows,
-    estimated,
-    held_parameters,
-)
+from diffeo_calib.calibration.identification.identification import KindRows, Rows, estimated, held_parameters
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.fitting.result import silent

@@ -98,14 +98,9 @@ def seen_grid(text: str, number: int = 0, squares: bool = False) -> np.ndarray:
 GRID = "aruco:{}:0.05:0.015:DICT_5X5_250{}"
 
 
-@pytest.mark.parametrize(
-    ("real", "said"),
-    [
-        (GRID.format("3x4", ":0:down-right"), GRID.format("3x4", "")),
-        (GRID.format("4x3", ":30:left-up"), GRID.format("4x3", "")),
-    ],
-)
-def test_another_layout_is_refused_and_named(real: str, said: str) -> None:
+@pytest.mark.parametrize(("size", "corner"), [("3x4", ":0:down-right"), ("4x3", ":30:left-up")])
+def test_another_layout_is_refused_and_named(size: str, corner: str) -> None:
+    real, said = (GRID.format(size, words) for words in (corner, ""))
     image = seen_grid(real)
     with pytest.raises(InputError, match=r"no plane explains, by \d+\.\d px|got none"):
         Board.of(said).corners(image)

@@ -238,10 +238,8 @@ DAMAGED = {
     "a number beyond all cameras": (r"data: \[", "data: [1e300, ", "distortion_coefficients"),
     "no text": (r"camera_matrix", "\udcff", "utf-8"),
 }
-REFUSED |= {
-    damage: (re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}")
-    for damage, (pattern, other, message) in DAMAGED.items()
-}
+for damage, (pattern, other, message) in DAMAGED.items():
+    REFUSED[damage] = re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}"
 for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # nor these
     REFUSED[f"long {piece}"] = "camera_matrix:" + piece * (900_000 // len(piece)), "camera_matrix"
     REFUSED[f"too long {piece}"] = piece * (1_100_000 // len(piece)), "too large for a camera file: .* at most 1 MB"

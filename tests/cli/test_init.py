@@ -45,14 +45,14 @@ def write_arm(folder: Path, *joints: tuple[str, ...]) -> None:
     (folder / "arm.urdf").write_text(text)
 
 
-@pytest.mark.parametrize(
-    ("slide", "why"),
-    [
-        (OPENING[:, :0], ""),
-        (20.0 + 0.0 * OPENING, "slide hardly moves in the table"),
-        (OPENING, "with slide the nominal robot leaves"),
-    ],
+SLIDES = (
+    (OPENING[:, :0], ""),
+    (20.0 + 0.0 * OPENING, "slide hardly moves in the table"),
+    (OPENING, "with slide the no"),
 )
+
+
+@pytest.mark.parametrize(("slide", "why"), SLIDES)
 def test_the_tip_is_before_a_gripper(slide: Tensor, why: str, tmp_path: Path, proposed: Proposed) -> None:
     write_arm(tmp_path, *GRIPPER)
     q, points = rows()
@@ -156,17 +156,17 @@ def test_wished_places_and_names_that_contradict_the_numbers(proposed: Proposed)
     assert f"No column is named after {NAMES[3]}" in text
 
 
-@pytest.mark.parametrize(
-    ("names", "written"),
-    [(("Hz [gon]", "V [gon]"), "zenith_clockwise_gon"), (("Azimuth", "Elevation"), "elevation_gon")],
-)
-def test_places_as_a_distance_and_angles(names: tuple[str, str], written: str, proposed: Proposed) -> None:
+def test_places_as_a_distance_and_angles(proposed: Proposed) -> None:
     """Only the robot tells in which direction the angles count, and, without names of units, in which unit."""
     q, points = rows()
-    seen = to_spherical(points, written) * torch.tensor([1.0, GON, GON])
-    found, _ = proposed((SERIES, q), (["Slope dist", *names], seen))
-    assert found["position"] == [f"{written}=Slope dist,{names[0]},{names[1]}"]
-    assert (found["length"], found["angle"]) == ("mm", "deg")
+    for names, written in (
+        (["Hz [gon]", "V [gon]"], "zenith_clockwise_gon"),
+        (["Azimuth", "Elevation"], "elevation_gon"),
+    ):
+        seen = to_spherical(points, written) * torch.tensor([1.0, GON, GON])
+        found, _ = proposed((SERIES, q), (["Slope dist", *names], seen))
+        assert found["position"] == [f"{written}=Slope dist,{names[0]},{names[1]}"]
+        assert (found["length"], found["angle"]) == ("mm", "deg")
 
 
 def test_axes_that_stand_still_and_lines_without_joints(tmp_path: Path, proposed: Proposed, init: Proposed) -> None:

@@ -9,15 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import (
-    DiffeoCalibWarning,
-    InputError,
-    MeasurementError,
-    few,
-    listed,
-    sentence,
-    warn_user,
-)
+from diffeo_calib.common.errors import InputError, MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.common.quantiles import binomial_band, chi2_above, chi2_median, f_below, known, largest_known
 
 
@@ -46,9 +38,9 @@ def test_long_lists_are_cut_short() -> None:
 
 
 def test_warnings_point_at_the_line_outside_the_package() -> None:
-    with pytest.warns(DiffeoCalibWarning, match="^odd$") as direct:
+    with pytest.warns(dc.DiffeoCalibWarning, match="^odd$") as direct:
         warn_user("odd")
-    with pytest.warns(DiffeoCalibWarning, match="degrees") as nested:
+    with pytest.warns(dc.DiffeoCalibWarning, match="degrees") as nested:
         dc.Measurements([[90.0]], [[1, 2, 3]])  # through two functions of the package
     assert [one.filename for one in (*direct, *nested)] == [__file__] * 2
     assert nested[0].lineno == direct[0].lineno + 2

@@ -17,10 +17,9 @@ from diffeo_calib.common.threads import LARGE_MATRIX, allowed_threads, in_parall
 
 def counts() -> list[int]:
     """Number of threads of every OpenBLAS of NumPy and SciPy."""
+    of_torch = [one for one in threadpool_info() if "/torch" in one["filepath"]]
     return [
-        one["num_threads"]
-        for one in threadpool_info()
-        if one["internal_api"] == "openblas" and "/torch" not in one["filepath"]
+        own["num_threads"] for own in threadpool_info() if own["internal_api"] == "openblas" and own not in of_torch
     ]
 
 

@@ -129,35 +129,25 @@ def test_maps_without_program_or_table() -> None:
     assert tabulate([periodic_sum("gaussian", lengthscale=1e-4, count=400)]) is None
 
 
+BRANCH = DHRow(0.2, 0.7, 0.1, parent=1), DHRow(0.1, 0.2, 0.3, mimic={"j2": 0.5})
 TREES = {
     "two arms": lambda robot: robot,
     "hand to hand": lambda robot: robot.reversed("left"),
     "slides on a torso": lambda _: dc.from_dh(
-        [
-            (0.1, 0.4, 0.3, 0.0, "prismatic"),
-            (0.2, 0.3, 0.1),
-            (0.3, -0.5, 0.0, 0.2, "prismatic"),
-            DHRow(0.2, 0.7, 0.1, parent=1),
-            DHRow(0.1, 0.2, 0.3, mimic={"j2": 0.5}),
-        ],
-        names=["j1", "j2", "left_slide", "j4", "j5"],
-        tips={"left": 2, "right": 4},
+        [DHRow(0.1, 0.4, 0.3, 0.0, "prismatic"), (0.2, 0.3, 0.1), (0.3, -0.5, 0.0, 0.2, "prismatic"), *BRANCH],
+        **{"names": ["j1", "j2", "left_slide", "j4", "j5"], "tips": {"left": 2, "right": 4}},
     ),
 }
 
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("name", "tip"),
-    [
-        ("two arms", -1),
-        *(pytest.param(name, 0, marks=pytest.mark.slow) for name in ("hand to hand", "slides on a torso")),
-    ],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "two arms")) for name in TREES]
 )
-def test_branches_bend_a_common_torso(name: str, tip: int, tmp_path: Path) -> None:
+def test_branches_bend_a_common_torso(name: str, tmp_path: Path) -> None:
     """Every branch weighs on the joints before it; a joint of another branch moves the tip by its sag alone."""
     robot = TREES[name](two_arms_bank.robot(tmp_path))
-    agree("c", deformation_of(robot, integrator=dc.RK4(1)), tmp_path, tip=robot.tips[tip])
+    agree("c", deformation_of(robot, integrator=dc.RK4(1)), tmp_path, tip=robot.tips[-(name == "two arms")])
     assert "on_path" in (tmp_path / "generated.c").read_text()
 
 

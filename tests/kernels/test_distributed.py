@@ -21,11 +21,8 @@ from diffeo_calib.kernels.reductions.tiled import Tiled
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("distributed_program.py")
-ENVIRONMENT = {
-    **os.environ,
-    "OMP_NUM_THREADS": "1",
-    "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("", "tests/banks", "benchmarks/paper_arm")),
-}
+PATHS = os.pathsep.join(str(ROOT / name) for name in ("", "tests/banks", "benchmarks/paper_arm"))
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATHS}
 PATIENCE = 280.0
 
 

@@ -2,21 +2,10 @@
 
 from collections.abc import Callable
 
+import math_bank
 import pytest
 import torch
-from math_bank import (
-    CASES,
-    MIXED,
-    NAMES,
-    Case,
-    case_named,
-    circle,
-    constant_kernel,
-    normal,
-    rows_jacobian,
-    tensor,
-    uniform,
-)
+from math_bank import CASES, MIXED, NAMES, Case, case_named, circle, normal, rows_jacobian, tensor
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -119,13 +108,13 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "matern": lambda s, v: dc.Matern(s, 1.5, v, space=MIXED),
     "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
     "von-mises": dc.VonMises,
-    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + constant_kernel(v),
+    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + math_bank.constant_kernel(v),
 }
 
 
 @pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
 def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) -> None:
-    x = uniform(4, 3, seed=1)
+    x = math_bank.uniform(4, 3, seed=1)
     left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
     scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, v: build(s, v).gram(x, left, x, right), (scales, variance), atol=1e-7)

@@ -113,9 +113,7 @@ def test_what_is_unmistakable_is_read_and_proposed(name: str, read: Reader, tmp_
 
 MARKERS = {
     "names above the first of three": ",,M1,,,M 2,,\nq1,q2,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n",
-    "names above each": (
-        ",,Marker,Marker,Marker,Marker,Marker,Marker\n,,M1,M1,M1,M 2,M 2,M 2\n,,a0,a0,a0,b1,b1,b1\nq1,q2,X,Y,Z,X,Y,Z\n"
-    ),
+    "names above each": ",,M,M,M,M,M,M\n,,M1,M1,M1,M 2,M 2,M 2\n,,a0,a0,a0,b1,b1,b1\nq1,q2,X,Y,Z,X,Y,Z\n",
 }
 
 
@@ -148,8 +146,8 @@ def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) 
     robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
     how: dict[str, Any] = {"length": "mm", "angle": "deg"}
     for slide, own in (
-        (250, {"joints": JOINTS, "kinds": ["prismatic", "continuous"]}),
-        (0.25, {"joints": JOINTS, "kinds": robot.kinds, "joint_length": "m"}),
+        (250, {"kinds": ["prismatic", "continuous"]}),
+        (0.25, {"kinds": robot.kinds, "joint_length": "m"}),
     ):
         data = read(HEADER + f"{slide},90,1000,0,500\n", **own, **how)
         assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))

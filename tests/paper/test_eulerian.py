@@ -70,9 +70,8 @@ def naive_rates(equations: Eulerian, x: np.ndarray, state: list[list[np.ndarray]
 @pytest.mark.parametrize("equations", SWITCHES, ids=name)
 def test_17_and_19_against_loops(equations: Eulerian) -> None:
     x = small_problem().x.numpy()
-    start = np.stack(
-        [np.concatenate([rr_derivatives(a)[0], b, rr_derivatives(a)[1].ravel()]) for a, b in zip(x, P0, strict=True)]
-    )
+    first = [(*rr_derivatives(a)[:2], b) for a, b in zip(x, P0, strict=True)]
+    start = np.stack([np.concatenate([k, b, J.ravel()]) for k, J, b in first])
 
     def field(packed: Tensor) -> Tensor:
         state = [[row[:2], row[2:4], row[4:].reshape(2, 2)] for row in packed.numpy()]

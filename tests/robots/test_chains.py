@@ -83,10 +83,7 @@ def bad_origin(entry: float, row: int, column: int) -> torch.Tensor:
     return matrix
 
 
-RIGID, OFFSET = (
-    "origin of joint 'j': expected a rigid transform",
-    "mimic offset of joint 'j': expected a finite number, got",
-)
+RIGID, OFFSET = "origin of joint 'j': expected a rigid transform", "offset of joint 'j': expected a finite number, got"
 EYE, MAPPING = torch.eye(4), "the mimic of joint 'j': expected a mapping from names of joints to multipliers"
 
 

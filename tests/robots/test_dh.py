@@ -60,10 +60,8 @@ def test_millimetres_are_warned_about(row: tuple[float, float, float]) -> None:
         from_dh([(1e308, 0.0, 0.0)])
 
 
-BRANCHED = [
-    DHRow(0.0, pi / 2, 0.4),
-    DHRow(0.1, 0.3, 0.2, 0.5),
-    DHRow(0.2, -0.7, 0.1, kind="prismatic"),
+BRANCHED = [DHRow(0.0, pi / 2, 0.4), DHRow(0.1, 0.3, 0.2, 0.5), DHRow(0.2, -0.7, 0.1, kind="prismatic")]
+BRANCHED += [
     DHRow(0.3, 1.1, 0.0),
     DHRow(-0.2, 0.4, 0.1, parent=1),
     DHRow(0.1, -0.9, 0.3),
@@ -122,13 +120,8 @@ def test_wrong_tables_are_explained(rows: Any, arguments: dict[str, Any], messag
         from_dh(rows, **arguments)
 
 
-ROWS = [
-    DHRow(0.05, -pi / 2, 0.4, 0.0, lower=-3.0, upper=2.5),
-    DHRow(0.43, 0.0, -0.02, -pi / 2),
-    DHRow(0.0, pi / 2, 0.15, 0.0, "prismatic"),
-    DHRow(-0.01, -pi / 2, 0.0, pi),
-]
-"""Of an invented arm."""
+ROWS = [DHRow(0.05, -pi / 2, 0.4, 0.0, lower=-3.0, upper=2.5), DHRow(0.43, 0.0, -0.02, -pi / 2)]
+ROWS += [DHRow(0.0, pi / 2, 0.15, 0.0, "prismatic"), DHRow(-0.01, -pi / 2, 0.0, pi)]
 Q = torch.tensor([[0.3, -0.7, 0.2, 1.1], [-1.2, 0.4, -0.1, 0.6]], dtype=torch.float64)
 
 

@@ -222,13 +222,8 @@ def own_features(robot: Tree, q: Tensor) -> dict[str, Tensor]:
 
 def contained(here: dict[str, Tensor], there: dict[str, Tensor]) -> float:
     """Largest part of one robot's features that no combination of the same joint's features of the other gives."""
-    left = [
-        float((there[name] @ torch.linalg.lstsq(there[name], one, driver="gelsd").solution - one).abs().max())
-        for name, one in here.items()
-        if name in there
-    ]
-    assert left
-    return max(left)
+    both, of = [(there[name], one) for name, one in here.items() if name in there], torch.linalg.lstsq
+    return max(float((own @ of(own, one, driver="gelsd").solution - one).abs().max()) for own, one in both)
 
 
 @pytest.mark.parametrize("name", ["serial", "arm", "two arms"])
