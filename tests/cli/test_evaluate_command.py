@@ -64,10 +64,8 @@ def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, comman
 
 
 def test_errors_that_no_robot_has(site: Site, path: Path, command: Command) -> None:
-    too_large, mirrored = (
-        (["--length", "m"], "1000 times too large"),
-        (["--position", "my,mx,mz"], "left-handed: exchange"),
-    )
+    too_large = ["--length", "m"], "1000 times too large"
+    mirrored = ["--position", "my,mx,mz"], "left-handed: exchange"
     for options, words in (too_large, mirrored):
         done = command("evaluate", path, site.csv, *(TABLE[2:] if "--position" in options else TABLE), *options)
         assert (done.code, "in all" in done.out) == (1, False)

@@ -45,11 +45,7 @@ def write_arm(folder: Path, *joints: tuple[str, ...]) -> None:
     (folder / "arm.urdf").write_text(text)
 
 
-SLIDES = (
-    (OPENING[:, :0], ""),
-    (20.0 + 0.0 * OPENING, "slide hardly moves in the table"),
-    (OPENING, "with slide the no"),
-)
+SLIDES = (OPENING[:, :0], ""), (20.0 + 0.0 * OPENING, "slide hardly moves"), (OPENING, "with slide the nominal robot")
 
 
 @pytest.mark.parametrize(("slide", "why"), SLIDES)
@@ -159,10 +155,8 @@ def test_wished_places_and_names_that_contradict_the_numbers(proposed: Proposed)
 def test_places_as_a_distance_and_angles(proposed: Proposed) -> None:
     """Only the robot tells in which direction the angles count, and, without names of units, in which unit."""
     q, points = rows()
-    for names, written in (
-        (["Hz [gon]", "V [gon]"], "zenith_clockwise_gon"),
-        (["Azimuth", "Elevation"], "elevation_gon"),
-    ):
+    clockwise, up = ("Hz [gon]", "V [gon]", "zenith_clockwise_gon"), ("Azimuth", "Elevation", "elevation_gon")
+    for *names, written in (clockwise, up):
         seen = to_spherical(points, written) * torch.tensor([1.0, GON, GON])
         found, _ = proposed((SERIES, q), (["Slope dist", *names], seen))
         assert found["position"] == [f"{written}=Slope dist,{names[0]},{names[1]}"]

@@ -17,10 +17,8 @@ from diffeo_calib.common.threads import LARGE_MATRIX, allowed_threads, in_parall
 
 def counts() -> list[int]:
     """Number of threads of every OpenBLAS of NumPy and SciPy."""
-    of_torch = [one for one in threadpool_info() if "/torch" in one["filepath"]]
-    return [
-        own["num_threads"] for own in threadpool_info() if own["internal_api"] == "openblas" and own not in of_torch
-    ]
+    pools = [one for one in threadpool_info() if "/torch" not in one["filepath"]]
+    return [one["num_threads"] for one in pools if one["internal_api"] == "openblas"]
 
 
 def test_one_thread_inside_and_as_many_as_before_outside() -> None:

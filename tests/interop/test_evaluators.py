@@ -141,9 +141,7 @@ TREES = {
 
 
 @needs_compiler
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "two arms")) for name in TREES]
-)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[pytest.mark.slow] * (k != "two arms")) for k in TREES])
 def test_branches_bend_a_common_torso(name: str, tmp_path: Path) -> None:
     """Every branch weighs on the joints before it; a joint of another branch moves the tip by its sag alone."""
     robot = TREES[name](two_arms_bank.robot(tmp_path))

@@ -145,10 +145,8 @@ def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
 def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) -> None:
     robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
     how: dict[str, Any] = {"length": "mm", "angle": "deg"}
-    for slide, own in (
-        (250, {"kinds": ["prismatic", "continuous"]}),
-        (0.25, {"kinds": robot.kinds, "joint_length": "m"}),
-    ):
+    in_mm, in_m = {"kinds": ["prismatic", "continuous"]}, {"kinds": robot.kinds, "joint_length": "m"}
+    for slide, own in ((250, in_mm), (0.25, in_m)):
         data = read(HEADER + f"{slide},90,1000,0,500\n", **own, **how)
         assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
         assert data.points.tolist() == [[[1.0, 0.0, 0.5]]]
