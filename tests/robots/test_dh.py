@@ -61,12 +61,7 @@ def test_millimetres_are_warned_about(row: tuple[float, float, float]) -> None:
 
 
 BRANCHED = [DHRow(0.0, pi / 2, 0.4), DHRow(0.1, 0.3, 0.2, 0.5), DHRow(0.2, -0.7, 0.1, kind="prismatic")]
-BRANCHED += [
-    DHRow(0.3, 1.1, 0.0),
-    DHRow(-0.2, 0.4, 0.1, parent=1),
-    DHRow(0.1, -0.9, 0.3),
-    DHRow(0.5, 0.2, 1, parent=-1),
-]
+BRANCHED += [DHRow(0.3, 1.1, 0.0), DHRow(-0.2, 0.4, 0.1, parent=1), DHRow(0.1, -0.9, 0.3), DHRow(1, 0.2, 1, parent=-1)]
 PATHS = {"tip_1": [0, 1, 2, 3], "tip_2": [0, 1, 4, 5], "tip_3": [6]}
 
 
