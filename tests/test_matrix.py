@@ -315,7 +315,7 @@ def _(bench: Bench) -> None:
     assert len(table_rows(path)) == 4
 
 
-@verb("compare with a table")
+@verb("compare with a table", *HELD_OUT, "distances", "images", "several kinds", "inclinations")
 def _(bench: Bench) -> None:
     kind = bench.kind
     kind_bank.share_places(kind, "recalibrate", bench.command.monkeypatch)
@@ -340,6 +340,7 @@ def _(bench: Bench) -> None:
     one_tip = kind.name != "several tips"
     kind_bank.share_places(kind, "recalibrate", bench.command.monkeypatch)
     found = kind.recalibrated
+    assert not found.changes.found
     kind_bank.check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
     assert found.model.summary is not None

@@ -172,8 +172,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     out, page = folder / "corners.csv", folder / "page.html"
     words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out]
-    done = command(*words, "--report", page)
-    assert done.code == 0, done.err
+    done = command.ran(*words, "--report", page)
     assert "small.png: a resized" in done.out
     assert "text.png: cannot be read" in done.out
     lines = out.read_text().splitlines()
@@ -186,8 +185,7 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     assert text.count("<img") == 5
     assert "3 of 5 images" in text
     (folder / "joints.csv").write_text((folder / "joints.csv").read_text().replace(",", ";"))
-    done = command(*words, "--sep", ";", "--decimal", ",")
-    assert done.code == 0, done.err
+    done = command.ran(*words, "--sep", ";", "--decimal", ",")
     assert [line.replace(",", ".").replace(";", ",") for line in out.read_text().splitlines()] == lines
 
 
@@ -257,8 +255,7 @@ def test_folders_of_two_cameras_become_one_table(tmp_path: Path, command: Comman
             cv2.imwrite(str(tmp_path / camera / f"{k}.png"), image(k))
     (tmp_path / "joints.csv").write_text("image,q1\n" + "\n".join(f"{k}.png,{k}" for k in range(3)))
     folders, out = (tmp_path / "left", tmp_path / "right"), tmp_path / "corners.csv"
-    done = command("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
-    assert done.code == 0, done.err
+    command.ran("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
     head, *lines = out.read_text().splitlines()
     assert head.endswith("v,camera")
     found = {(line.split(",")[0], line.split(",")[-1]) for line in lines}

@@ -196,8 +196,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     (tmp_path / "run.csv").write_text("".join([*lines[:3], "1,2,three\n", *lines[3:]]))
     assert "changed after" in command(*words).error
     (tmp_path / "run.csv").write_text("".join([*lines[:18], "1,2,three\n", *lines[18:21]]))
-    done = command(*accepted)
-    assert done.code == 0
+    done = command.ran(*accepted)
     for words in ("going on after 14 lines", "mm as m", "line 19 left out"):
         assert words in done.out
     assert "row 15 " not in done.out
@@ -205,7 +204,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept[:-1])
     with (tmp_path / "run.csv").open("a") as file:
         file.write(lines[21])
-    assert command(*accepted, "--tolerance", "50mm").code == 0
+    command.ran(*accepted, "--tolerance", "50mm")
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
 
 
@@ -222,7 +221,7 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     (tmp_path / "run.csv").write_text("".join(lines[:4]))
     robot = (tmp_path / "robot.urdf").read_text()
     words = ["campaign", tmp_path / "campaign.toml", "--once"]
-    assert command(*words).code == 0
+    command.ran(*words)
     journal = (tmp_path / "run.csv.journal").read_bytes()
     for more, named in (
         (["--length", "m"], "expected length mm, got length m;"),
@@ -249,7 +248,7 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     (tmp_path / "run.csv.journal").write_bytes(twice)
     assert "got 4 verdicts of 3 rows; name another table" in command(*words).error
     (tmp_path / "run.csv.journal").write_bytes(old)
-    assert command(*words).code == 0
+    command.ran(*words)
 
 
 WORDS = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--base", "base_link", "--tip", "flange"]

@@ -44,8 +44,7 @@ def numbers_in(path: Path) -> tuple[list[str], np.ndarray]:
 
 def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     """Numbers of all rows, and the residuals of each: measured minus predicted."""
-    done = command("evaluate", path, site.csv, *TABLE, "-o", tmp_path / "r.csv")
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("evaluate", path, site.csv, *TABLE, "-o", tmp_path / "r.csv", silent=True)
     assert model.provenance is not None
     assert model.provenance.table_sha256 == hashlib.sha256(site.csv.read_bytes()).hexdigest()
     digest = model.provenance.table_sha256[:12]
@@ -83,8 +82,7 @@ def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command,
     points = site.data.points.clone()
     points[3] += 0.05
     points[30:] += torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
-    done = command("evaluate", path, written(site, tmp_path / "t.csv", site.data.q, points), *TABLE)
-    assert done.code == 0
+    done = command.ran("evaluate", path, written(site, tmp_path / "t.csv", site.data.q, points), *TABLE)
     assert "11 of 40 rows look wrong (numbers are lines of the file):" in done.out
     (warning,) = done.warnings
     assert "10 rows look wrong that follow one another: lines 32 to 41 to the end of the table" in warning
@@ -93,8 +91,7 @@ def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command,
 
 def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     command.monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", 7)
-    done = command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv")
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv", silent=True)
     assert [words in done.out for words in ("40 predictions written", f"; note: {NOTE}")] == [True, True]
     header, values = numbers_in(tmp_path / "p.csv")
     assert header == [*site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
@@ -116,12 +113,10 @@ def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command
 )
 def test_predicted_poses(options: list[str], columns: list[str], command: Command, tmp_path: Path) -> None:
     kind, path = kind_named("poses"), tmp_path / "p.csv"
-    done = command("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path)
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path, silent=True)
     printed = re.search(r"`evaluate` and `fit` read these poses with (--.*)", done.out)
     assert printed is not None
-    again = command("evaluate", kind.file, path, *UNITS, *shlex.split(printed[1]), "--json", tmp_path / "e.json")
-    assert again.code == 0
+    command.ran("evaluate", kind.file, path, *UNITS, *shlex.split(printed[1]), "--json", tmp_path / "e.json")
     assert json.loads((tmp_path / "e.json").read_text())["results"]["errors"]["all"]["rms_m"] < 1e-6
     header, *rows = path.read_text().splitlines()
     places, deviations = ["x", "y", "z", "std_x", "std_y", "std_z"], ["std_rx", "std_ry", "std_rz"]
@@ -171,8 +166,7 @@ def test_what_moved_is_named(marker: float, site: Site, path: Path, command: Com
 
 def test_registered(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     new, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
-    done = command("evaluate", path, new, *TABLE, "--free", "both", "-o", output)
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("evaluate", path, new, *TABLE, "--free", "both", "-o", output, silent=True)
     assert done.numbers("8 with the places of the fit")[0] > 10.0
     assert done.numbers("8 with places found anew")[0] < 0.5
     for words in (
@@ -196,14 +190,11 @@ def test_registered(site: Site, path: Path, model: dc.CalibratedKinematics, comm
 
 def test_options_of_the_registration(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
     new, two = table(site, tmp_path / "new.csv", MOVE, 8), table(site, tmp_path / "two.csv", MOVE, 2)
-    done = command("evaluate", path, new, *TABLE, "--free", "base")
-    assert done.code == 0
+    done = command.ran("evaluate", path, new, *TABLE, "--free", "base")
     assert "in the frame of 'flange'" not in done.out
     for words, message in (
         ([new, "-o", tmp_path / "m.safetensors"], "-o without --free: expected a table of errors, got "),
         ([new, "--free", "both", "-o", path], f"-o {path} is the file of MODEL; name another file."),
         ([two, "--free", "both"], "expected at least 3 rows, got 2"),
     ):
-        refused = command("evaluate", path, *words, *TABLE)
-        assert refused.code == 1
-        assert message in refused.error
+        assert message in command.failed("evaluate", path, *words, *TABLE)

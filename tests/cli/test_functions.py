@@ -68,8 +68,7 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     done = command("evaluate", model, "delta.csv")
     assert done.code == 1
     assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=" in done.error
-    done = command("predict", model, "delta.csv", *pose, "-o", "p.csv")
-    assert done.code == 0, done.error
+    done = command.ran("predict", model, "delta.csv", *pose, "-o", "p.csv")
     text = Path("my_delta.py").read_text(encoding="utf-8")
     for written, options, away in (("300.5 *", [], r"0\.\d+ mm"), ("300 *", ["--length", "m"], r".e\+05 mm")):
         joints._names.cache_clear()
@@ -89,16 +88,15 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     nominal, exact = kinematics(q), 1.001 * kinematics(q + torch.tensor([0.1, -0.05, 0.08]))  # without noise
     assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
     assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * without_frames(nominal, exact)
-    assert command("plan", model, "-n", "3", *pose, "-o", "n.csv").code == 0
+    command.ran("plan", model, "-n", "3", *pose, "-o", "n.csv")
     assert cells(Path("n.csv"))[0] == ["x", "y", "z", "rank"]
-    done = command("correct", model, "targets.csv", *pose, "-o", "c.csv")
-    assert done.code == 0, done.error
+    done = command.ran("correct", model, "targets.csv", *pose, "-o", "c.csv")
     header, *rows = cells(Path("c.csv"))
     assert {row[header.index("status")] for row in rows} == {"reached"}
     corrected = [[float(row[header.index(axis)]) for axis in "xyz"] for row in rows]
     assert "q1" not in header  # of the program before
     again = write_columns(Path("again.csv"), x_y_z=torch.tensor(corrected, dtype=torch.float64))
-    assert command("predict", model, again, "--robot-pose", "x,y,z", *MEASURED[2:], "-o", "a.csv").code == 0
+    command.ran("predict", model, again, "--robot-pose", "x,y,z", *MEASURED[2:], "-o", "a.csv")
     reached = [[float(cell) for cell in row[3:6]] for row in cells(Path("a.csv"))[1:]]
     wanted = nominal[:5] - nominal[:5].mean(0)
     assert without_frames(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device

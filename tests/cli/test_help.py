@@ -37,8 +37,7 @@ def entries(text: str) -> dict[str, str]:
 
 
 def test_the_program_s_help_names_every_command(command: Command) -> None:
-    done = command("--help")
-    assert done.code == 0
+    done = command.ran("--help")
     lines = [line.strip() for line in done.out.partition("Commands:")[2].splitlines() if line.strip()]
     assert [line.split()[0] for line in lines] == list(OPTIONS)
     assert all(line.endswith(".") and not line.endswith("...") for line in lines), "no sentence is cut off"
@@ -49,8 +48,7 @@ def test_the_program_s_help_names_every_command(command: Command) -> None:
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_help_explains_every_option(name: str, command: Command) -> None:
-    done = command(name, "--help")
-    assert done.code == 0
+    done = command.ran(name, "--help")
     assert done.out == command(name, "-h").out
     found = entries(done.out)
     assert set(found) == {*OPTIONS[name], "-h", "--help"}

@@ -256,7 +256,6 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
     found, text = proposed((NAMES, read), (XYZ, points))
     expected = f"{NAMES[0]},-{{{NAMES[1]}}},{{{NAMES[2]}}}-90,{','.join(NAMES[3:])}"
     assert found["joints"] == expected
-    assert "with the columns as they are" in text
     robot = ["--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"]
     done = command("fit", tmp_path / "t.csv", *robot, *GIVEN, "-o", tmp_path / "m")
     assert done.code == 1
@@ -279,8 +278,7 @@ def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, com
     write_measurements(tmp_path / "t.csv", data, table, position=positions)
     out = tmp_path / "sub" / "cell.toml"
     out.parent.mkdir()
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out)
-    assert (done.code, done.err) == (0, "")
+    done = command.ran("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out, silent=True)
     assert "the nominal robot leaves, of what the rows vary" in done.out
     words = expanded(["fit", str(out)])
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")

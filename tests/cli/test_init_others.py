@@ -71,14 +71,14 @@ def test_an_edited_file_is_kept(tmp_path: Path, command: Command, frame: Any) ->
     frame.rename(columns={axis: f"t{axis}" for axis in XYZ}).to_csv(tmp_path / "t.csv", index=False)
     out = tmp_path / "c.toml"
     words = "init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out
-    assert command(*words).code == 0
+    command.ran(*words)
     assert 'position = ["tx,ty,tz"]' in out.read_text()
     assert command(*words).code == 0  # the same again
     edited = out.read_text() + "holdout = 0\n"
     out.write_text(edited)
     assert "exists and holds other options" in command(*words).error
     assert out.read_text() == edited
-    assert command(*words, "--force").code == 0
+    command.ran(*words, "--force")
     assert "holdout" not in out.read_text()
 
 
@@ -121,6 +121,4 @@ def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command:
     table, _ = kind.table()
     written, _ = init(table, kind.urdf)
     assert (written["reading"], written["session"], written["angle"]) == ("image=u,v,FX,FY,CX,CY", "session", "deg")
-    refused = command("fit", tmp_path / "c.toml")
-    assert refused.code == 1
-    assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
+    assert "--reading image=u,v,FX,FY,CX,CY" in command.failed("fit", tmp_path / "c.toml")

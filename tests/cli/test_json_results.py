@@ -35,9 +35,7 @@ def test_errors_and_places_that_are_taken(folder: Path, command: Command) -> Non
     model, predicted = folder / "arm.safetensors", folder / "p.csv"
     before = model.read_bytes()
     for place, words in ((model, "--json"), (predicted, "--json"), (folder / "none" / "x.json", "make its folder")):
-        done = command("predict", model, folder / "new.csv", *UNITS, "-o", predicted, "--json", place)
-        assert done.code == 1
-        assert words in done.error
+        assert words in command.failed("predict", model, folder / "new.csv", *UNITS, "-o", predicted, "--json", place)
     assert model.read_bytes() == before
     assert not predicted.exists()
 

@@ -91,13 +91,11 @@ def test_options_that_do_not_go_together(words: list[str], message: str, files: 
 @pytest.mark.usefixtures("given_scales")
 def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
     init(files.joints, files.urdf, "--places", files.places)
-    done = command("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
-    assert done.code == 0, done.err
+    done = command.ran("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
     header, *lines = files.whole.read_text().splitlines()
     some = [line for line in lines if not line.endswith("left")]
     (tmp_path / "some.csv").write_text("\n".join([header, *some]) + "\n")
-    done = command("evaluate", tmp_path / "m.safetensors", tmp_path / "some.csv")
-    assert done.code == 0, done.err
+    done = command.ran("evaluate", tmp_path / "m.safetensors", tmp_path / "some.csv")
     assert done.numbers("in all")[0] < 0.1
     (tmp_path / "some.csv").write_text("\n".join([header, *some]).replace("front", "rear") + "\n")
     done = command("evaluate", tmp_path / "m.safetensors", tmp_path / "some.csv")

@@ -65,8 +65,7 @@ def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypat
 def test_model_and_table_are_enough(site: Site, sound_path: Path, command: Command, tmp_path: Path) -> None:
     model, out, results = site.folder / "model.safetensors", tmp_path / "out.json", list[object]()
     for options in ([], TABLE):
-        done = command("evaluate", model, site.csv, *options, "--json", out)
-        assert done.code == 0, done.err
+        done = command.ran("evaluate", model, site.csv, *options, "--json", out)
         assert ("read as at the fit: --position mx,my,mz" in done.out) == (not options)
         results.append(json.loads(out.read_text())["results"])
     assert results[0] == results[1]
@@ -76,8 +75,7 @@ def test_model_and_table_are_enough(site: Site, sound_path: Path, command: Comma
         (["plan", model, "-n", 2, "--draw", 10, "--joints", "A,B,C,D,E,F"], "A;B;C;D;E;F;rank"),
         (["correct", model, site.csv], joints),  # programs are read in the units of the fit
     ):
-        done = command(*words, "-o", tmp_path / "o.csv")
-        assert done.code == 0, done.err
+        done = command.ran(*words, "-o", tmp_path / "o.csv")
         assert (tmp_path / "o.csv").read_text().startswith(header)
     for words in (["evaluate", sound_path, site.csv], ["correct", sound_path, site.csv, "-o", tmp_path / "c.csv"]):
         assert "--length and --angle missing" in command(*words).error

@@ -108,11 +108,9 @@ def test_opencv_reads_the_files(tmp_path: Path) -> None:
 
 def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     kind, folder = kind_named("images of a board"), tmp_path / "camera"
-    done = command("export", kind.file, "--camera", folder)
-    assert done.code == 0, done.err
+    command.ran("export", kind.file, "--camera", folder)
     assert {path.name for path in folder.iterdir()} == set(camera_files(on_tool()))
-    rigid = command("export", kind.file, "--camera", folder, "--urdf", tmp_path / "a.urdf", "--robot", kind.urdf)
-    assert rigid.code == 0, rigid.err
+    rigid = command.ran("export", kind.file, "--camera", folder, "--urdf", tmp_path / "a.urdf", "--robot", kind.urdf)
     assert "the rigid kinematics" in rigid.out
     other = (folder / "hand_eye.yaml").read_text()
     assert other != camera_files(on_tool())["hand_eye.yaml"]

@@ -106,6 +106,7 @@ def test_import_is_late_and_silent_and_leaves_the_environment_alone(tmp_path: Pa
     assert (known, flags) == ([True, True, True], "-DOWN_FLAG")
     assert other != folder
     assert Path(other).is_dir()
+    assert in_a_process(LOAD, KEOPS_CACHE_FOLDER=str(tmp_path / "own"))[-1] == str(tmp_path / "own")
 
 
 FALL_BACK = """

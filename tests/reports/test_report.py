@@ -149,8 +149,7 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command)
     assert "40 rows that the model has not seen" in done.out.replace("\n", " ")
     assert "Errors against humidity" in text
     assert re.search(r"Errors against air_temp[^<]* 2 of 40 rows have no value", text)
-    alone = command("evaluate", model, "--report", out)
-    assert alone.code == 0
+    alone = command.ran("evaluate", model, "--report", out)
     assert "60 rows of the fit" in alone.out.replace("\n", " ")
 
 
@@ -167,9 +166,7 @@ def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Comm
         *((["--tolerance", text], f"--tolerance {text}") for text in ("0.5px", "0.15", "-1mm")),
     )
     for words, text in wrong:
-        done = command("evaluate", model, "--report", out, *words)
-        assert done.code == 1
-        assert text in done.err
+        assert text in command.failed("evaluate", model, "--report", out, *words)
     q, eye, two = arm.train.q, torch.eye(4, dtype=torch.float64).expand(60, 4, 4), arm.train.points.repeat(1, 2, 1)
     poses, markers = dc.Measurements.from_poses(q, eye), dc.Measurements(q, two)
     refused(
