@@ -195,9 +195,7 @@ LENSES = {
 }
 REFUSED = {
     "fisheye of ROS": (ECHO.format("equidistant", FIVE[:-5]), "equidistant"),
-    "fisheye of OpenCV": (STORAGE + f"fisheye_model: 1\nD: [{FIVE[:-5]}]\n", "fisheye_model 1"),
     "omni": (KALIBR.format("omni", FIVE[:-5], "radtan") + "  intrinsics: [1.2, 500, 510, 310, 235]", "omni"),
-    "double sphere": (KALIBR.format("ds", "", "none") + "  intrinsics: [-0.2, 0.6, 500, 510, 310, 235]", "ds"),
     "KannalaBrandt8": ("Camera.type: 'KannalaBrandt8'\nCamera.fx: 500.\nCamera.k1: 0.1\n", "KannalaBrandt8"),
     "division": (ECHO.format("division", "-0.2"), "division"),
     "rational": (ECHO.format("rational_polynomial", FIVE + ", 0.1, 0.0, 0.0"), "0.1, 0.0, 0.0"),
@@ -206,7 +204,6 @@ REFUSED = {
     "no size": (STORAGE.replace("image_size", "size") + f"D: [{FIVE}]\n", "image_width"),
     "nothing": ("", r"camera\.yaml.*camera_matrix"),
     "a tag without an end": ("<" + 900_000 * "a", "camera_matrix"),  # which quadratic time would not read
-    "words": ("camera_matrix:\n  data: [1, x]\n", r"camera\.yaml.*camera_matrix"),
     "no lens": ("a: [1, 2]\nimage_width: 3\nimage_height: 3\nd: [0, 0, 0, 0]", r"`camera_matrix`.*`k`.*Kalibr.*fx"),
 }
 
@@ -231,7 +228,6 @@ def test_lenses_that_files_leave_open_are_said(tmp_path: Path) -> None:
 FILE = camera_text(FOUND.camera)
 DAMAGED = {
     "a number that is none": (r"image_width: \d+", "image_width: e", "image_width"),
-    "a negative size": (r"image_height: \d+", "image_height: -5", "image_height"),
     "no row of the root": (r"root:(.*)data: \[[^,]*, ", r"root:\1data: [", "root"),
     "no root": (r"root:(.*)data: \[.*\]", r"root:\1data: []", "root"),
     "a matrix without an end": (r"\]", "", "camera_matrix"),

@@ -74,11 +74,9 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
     ("options", "message"),
     [
         ([], "name the position columns, or those of --socket or --reading"),
-        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
         (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
-        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),

@@ -270,7 +270,6 @@ def test_the_header_tells_what_it_is_of_and_names_cannot_end_a_comment(tmp_path:
     ("path", "options", "message"),
     [
         ("model.cpp", {}, "`path`: expected the name of a C file"),
-        ("/", {}, "`path`: expected the name of a C file"),
         ("model.c", {"frame": "world"}, "`frame`: expected 'base' or 'measuring', got 'world'"),
         ("model.c", {"prefix": "a-b"}, "prefix of names in C"),
         ("7axes.c", {}, "pass `prefix`"),

@@ -207,7 +207,7 @@ def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
     for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
         with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
             write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)
-    new, path = tmp_path / "ur.yaml", tmp_path / "ur.urdf"
+    new, path = tmp_path / "new.yaml", tmp_path / "ur.urdf"
     with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
         write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)
     text = urdf()

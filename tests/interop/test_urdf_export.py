@@ -128,8 +128,8 @@ def test_files_that_are_not_of_the_robot(tmp_path: Path) -> None:
         write_urdf(wrong(chain), new, robot=tmp_path / "none.urdf")
     chain = dc.from_dh([(0.1, 0.2, 0.3), (0.1, 0, 0)])
     with pytest.raises(InputError, match=r"'robot' does not hold the URDF that it was fitted with; pass the file"):
-        write_urdf(wrong(chain), tmp_path / "new.urdf")
-    assert not (tmp_path / "new.urdf").exists()
+        write_urdf(wrong(chain), tmp_path / "none.urdf")
+    assert not (tmp_path / "none.urdf").exists()
     chain = write_ugly(tmp_path / "robot.urdf", UGLY.replace('name="grip"', 'name="pan"'))
     with pytest.raises(RobotError, match=r"joint 'pan' in the URDF of .*: expected one <joint> with this name, got 2"):
         write_urdf(wrong(chain), tmp_path / "new.urdf")

@@ -115,11 +115,11 @@ def test_compiled_code_is_kept_where_it_can_be(tmp_path: Path, monkeypatch: pyte
         found = fused(FIELD, GaussianProfile(), None, j)
     assert_same(found, Dense().reduce(FIELD, GaussianProfile(), None, j), 1e-12)
     # nor a full disk, which would become fuller with every process
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "full"))
     monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
     monkeypatch.setattr(sums, "machine", cache(sums.Machine))
     fused(FIELD, GaussianProfile(), None, j)
-    assert list((tmp_path / "diffeo_calib" / "fused").iterdir()) == []
+    assert list((tmp_path / "full" / "diffeo_calib" / "fused").iterdir()) == []
 
 
 def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
