@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import rigid_rms
+from kind_bank import kind_named, rigid_rms
 from reading_bank import DISTANCES, readings
 from reading_bank import scales as usual
-from simulated_sockets import SocketRows, rest_in_sockets
+from simulated_sockets import rest_in_sockets
 from table_bank import refused
 from torch import Tensor
 
@@ -30,90 +30,47 @@ from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.coordinates import fitting_devices
 
-TRACKED = 25
-"""Rows of the tracker in a mixture; the other 20 are new."""
-
-
-@pytest.fixture(scope="module")
-def arm() -> SimulatedArm:
-    """Marker 0 is the ball; the tracker sees marker 1."""
-    return SimulatedArm(seed=3, markers=2)
-
-
-@pytest.fixture(scope="module")
-def rows(arm: SimulatedArm) -> SocketRows:
-    return rest_in_sockets(arm, seed=3, places=4, rows=8)
-
-
-@pytest.fixture(scope="module")
-def resting(rows: SocketRows, arm: SimulatedArm) -> dc.Measurements:
-    names = arm.nominal.joint_names
-    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
-
-
-@pytest.fixture(scope="module")
-def tracked(arm: SimulatedArm) -> dc.Measurements:
-    q, points = arm.measure(TRACKED + 20, seed=5)
-    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-
-
-@pytest.fixture(scope="module")
-def mixture(tracked: dc.Measurements, resting: dc.Measurements) -> dc.Measurements:
-    return dc.Measurements.joined([tracked.rows(slice(TRACKED)), resting])
-
-
-@pytest.fixture(scope="module")
-def scales(arm: SimulatedArm, tracked: dc.Measurements) -> dc.Hyperparameters:
-    noise = torch.tensor(2e-5, dtype=torch.float64)
-    return replace(dc.calibrate(arm.nominal, tracked).selection.scales, other_noise=noise)
-
-
-@pytest.fixture(scope="module")
-def result(arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters) -> Any:
-    return dc.calibrate(arm.nominal, mixture, hyperparameters=scales)
+MIXED = kind_named("mixture")
+"""Marker 0 is the ball; the tracker sees marker 1."""
 
 
 def rms(errors: Tensor) -> float:
     return float(errors.square().sum(-1).mean().sqrt())
 
 
-def test_several_set_ups_of_the_device(
-    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
-) -> None:
+def test_several_set_ups_of_the_device() -> None:
     """Rows in sockets belong to no set-up, and the places of the robot to all."""
     T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
-    device, resting = mixture.parts
-    second = torch.arange(TRACKED) % 3 == 1
+    device, resting = MIXED.source.rows.parts
+    second, truth = torch.arange(len(device)) % 3 == 1, MIXED.source.truth
     points = torch.where(second[:, None, None], device.points @ T[:3, :3].mT + T[:3, 3], device.points)
     moved = with_attributes(device, points=points).with_sessions(["ab"[int(flag)] for flag in second])
-    both = dc.Measurements.joined([moved, resting])
-    found = dc.calibrate(arm.nominal, both, hyperparameters=scales)
+    found = dc.calibrate(MIXED.robot, dc.Measurements.joined([moved, resting]), hyperparameters=MIXED.scales)
     torch.testing.assert_close(found.sessions.transforms[1], T, rtol=0, atol=5e-4)
-    q = arm.sample(100, seed=2)
-    assert rms(found.model(q) - arm.true_points(q).flip(1)) < 1.5 * rms(result.model(q) - arm.true_points(q).flip(1))
+    q = MIXED.q(100)
+    assert rms(found.model(q) - truth(q)) < 1.5 * rms(MIXED.model(q) - truth(q))
 
 
 @pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
-def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
+def test_rows_of_another_robot() -> None:
     bend = torch.zeros(6, dtype=torch.float64)
     bend[4] = 0.05
+    tracked, resting = MIXED.source.rows.parts
     other = with_attributes(resting, q=resting.q + bend, distances=())
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
-        place(arm.nominal, dc.Measurements.joined([tracked, other]), silent)
+        place(MIXED.robot, dc.Measurements.joined([tracked, other]), silent)
 
 
-def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:
+def test_refused() -> None:
     def staged(*tables: Any) -> Callable[[], object]:
-        return lambda: place(arm.nominal, dc.Measurements.joined(tables), silent)
+        return lambda: place(MIXED.robot, dc.Measurements.joined(tables), silent)
 
+    tracked, resting = MIXED.source.rows.parts
     large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
-    loaded = tracked.with_payload(1.0)
+    loaded, few = tracked.with_payload(1.0), r"sockets: expected at least 2 rows with each name, got '0/1' in 1 row"
     refused(
         ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
-        (
-            r"sockets: expected at least 2 rows with each name, got '0/1' in 1 row",
-            staged(tracked, resting.rows(slice(0, 9))),
-        ),
+        (few, staged(tracked, resting.rows(slice(0, 6)))),
         ("positions seem to be 1000 times too large", staged(large, resting)),
         ("rows with sockets: expected no payloads", staged(loaded, resting.with_payload(0.0))),
         ("the tables differ in payload", staged(loaded, resting)),
