@@ -67,12 +67,10 @@ def test_refused() -> None:
 
     tracked, resting = MIXED.source.rows.parts
     large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
-    loaded, few = tracked.with_payload(1.0), r"sockets: expected at least 2 rows with each name, got '0/1' in 1 row"
+    loaded = tracked.with_payload(1.0)
     refused(
         ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
-        (few, staged(tracked, resting.rows(slice(0, 6)))),
         ("positions seem to be 1000 times too large", staged(large, resting)),
-        ("rows with sockets: expected no payloads", staged(loaded, resting.with_payload(0.0))),
         ("the tables differ in payload", staged(loaded, resting)),
         ("the tables differ in joint_names", staged(tracked, resting.with_joint_names(renamed))),
     )

@@ -21,14 +21,7 @@ pytestmark = pytest.mark.slow  # several calibrations
 ARM = SimulatedArm(seed=1)
 
 
-@pytest.fixture(scope="module")
-def rows() -> dc.Measurements:
-    return kind_named("payloads").data
-
-
-@pytest.fixture(scope="module")
-def result() -> Any:
-    return kind_named("payloads").result
+KIND = kind_named("payloads")
 
 
 @pytest.fixture(scope="module")
@@ -39,48 +32,46 @@ def other() -> dc.Measurements:
     return dc.Measurements(q, ARM.true_points(q, masses)).with_payload(masses)
 
 
-def test_masses_beyond_the_fit(result: Any, other: dc.Measurements) -> None:
+def test_masses_beyond_the_fit(other: dc.Measurements) -> None:
     with pytest.warns(DiffeoCalibWarning, match="a payload of 20 is beyond the 0 to 10 in the measurements of the fit"):
-        result.model.with_payload(20.0)
+        KIND.model.with_payload(20.0)
     with pytest.warns(DiffeoCalibWarning, match="a payload of 30 is beyond"):
-        dc.evaluate(result.model, other.with_payload(30.0))
+        dc.evaluate(KIND.model, other.with_payload(30.0))
     for mass in (np.int64(4), np.float32(4), torch.tensor(4.0)):
-        assert result.model.with_payload(mass).payload == 4.0  # pyright: ignore[reportArgumentType]
+        assert KIND.model.with_payload(mass).payload == 4.0  # pyright: ignore[reportArgumentType]
 
 
-def test_sag_under_other_payloads_is_predicted(rows: dc.Measurements, result: Any, other: dc.Measurements) -> None:
-    assert result.fit.converged
-    without = with_usual_scales(ARM.nominal, rows.with_payload(None))
-    errors = dc.evaluate(result.model, other).rms, dc.evaluate(without.model, other.with_payload(None)).rms
+def test_sag_under_other_payloads_is_predicted(other: dc.Measurements) -> None:
+    assert KIND.result.fit.converged
+    without = with_usual_scales(ARM.nominal, KIND.data.with_payload(None))
+    errors = dc.evaluate(KIND.model, other).rms, dc.evaluate(without.model, other.with_payload(None)).rms
     assert errors[0] < 0.5 * errors[1]
     unknown = ARM.true_points(other.q, 10.0) - ARM.true_points(other.q, 0.0)
-    known = result.model.with_payload(10.0)(other.q) - result.model.with_payload(0.0)(other.q)
+    known = KIND.model.with_payload(10.0)(other.q) - KIND.model.with_payload(0.0)(other.q)
     assert float((known - unknown).norm(dim=-1).mean()) < 0.25 * float(unknown.norm(dim=-1).mean())
-    assert {part.name: part.displacement for part in result.parts}["payload"] > 1e-4
+    assert {part.name: part.displacement for part in KIND.result.parts}["payload"] > 1e-4
 
 
-def test_predicted_deviations_hold(result: Any, other: dc.Measurements) -> None:
+def test_predicted_deviations_hold(other: dc.Measurements) -> None:
     inside = []
     for mass in (1.0, 6.0, 8.5):
         own = other.payload == mass
-        mean, covariance = result.model.with_payload(mass).predict(other.q[own], noise=False)
+        mean, covariance = KIND.model.with_payload(mass).predict(other.q[own], noise=False)
         away = (other.points[own] - mean)[:, 0]
         inside.append((away * torch.linalg.solve(covariance[:, 0], away)).sum(-1) < 7.815)  # 95 % of chi-squared, 3
     assert float(torch.cat(inside).double().mean()) > 0.85
 
 
-def test_payloads_that_cannot_be(rows: dc.Measurements, result: Any, other: dc.Measurements) -> None:
-    few, loaded = dc.Measurements(*ARM.measure(11, seed=3)), result.model
-    with pytest.warns(DiffeoCalibWarning):
-        plain = dc.calibrate(ARM.nominal, few).model
+def test_payloads_that_cannot_be(other: dc.Measurements) -> None:
+    rows, loaded, plain = KIND.data, KIND.model, kind_named("positions")
 
     def calibrated(data: Any, **options: Any) -> Callable[[], object]:
         return lambda: dc.calibrate(ARM.nominal, data, **options)
 
     refused(
         ("calibrated with payloads, the measurements have none", lambda: dc.evaluate(loaded, other.with_payload(None))),
-        ("have payloads, the model was calibrated without", lambda: dc.evaluate(plain, few.with_payload(3.0))),
-        ("calibrated without payloads", lambda: plain.with_payload(3.0)),
+        ("have payloads, the model was calibrated without", lambda: dc.evaluate(plain.model, plain.new.with_payload(3.0))),
+        ("calibrated without payloads", lambda: plain.model.with_payload(3.0)),
         ("`mass` of the payload: expected a number of 0 or more, got -1", lambda: loaded.with_payload(-1.0)),
         ("expected a number of 0 or more", lambda: loaded.with_payload(10**400)),
         (r"expected 0 to 10 in .* of the fit, got 1e\+300; check its unit", lambda: loaded.with_payload(1e300)),

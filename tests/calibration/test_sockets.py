@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import kind_named
-from product_bank import with_usual_scales
-from reading_bank import scales
+from reading_bank import DISTANCES, scales
 from simulated_sockets import SocketRows, rest_in_sockets
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import covariance
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
@@ -27,32 +27,13 @@ from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.readings import SocketReadings
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
-DISTANCES = {("0", "1"): 0.05}
-
-
-@pytest.fixture(scope="module")
-def arm() -> SimulatedArm:
-    return SimulatedArm(seed=0)
-
-
-@pytest.fixture(scope="module")
-def rows(arm: SimulatedArm) -> SocketRows:
-    return rest_in_sockets(arm, seed=0, rows=12)
-
-
-@pytest.fixture(scope="module")
-def data(arm: SimulatedArm, rows: SocketRows) -> SocketReadings:
-    names = arm.nominal.joint_names
-    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
-
-
-@pytest.fixture(scope="module")
-def result(arm: SimulatedArm, data: SocketReadings) -> Any:
-    return with_usual_scales(arm.nominal, data)
+KIND = kind_named("ball in sockets")
+ARM, DATA = KIND.robot, KIND.data
 
 
 def aligned(points: Tensor, truth: Tensor) -> Tensor:
@@ -61,22 +42,21 @@ def aligned(points: Tensor, truth: Tensor) -> Tensor:
     return points @ T[:3, :3].mT + T[:3, 3] - truth
 
 
-def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
-    found = result.sockets
-    truth = torch.stack([rows.positions[name] for name in found.names])
-    errors = aligned(found.positions, truth)
-    assert float(errors.norm(dim=1).square().mean().sqrt()) < 6e-5
+def test_the_sockets_are_where_they_are() -> None:
+    found, rows = KIND.result.sockets, rest_in_sockets(SimulatedArm(seed=0), seed=3, places=5, rows=6)
+    errors = aligned(found.positions, torch.stack([rows.positions[name] for name in found.names]))
+    assert float(errors.norm(dim=1).square().mean().sqrt()) < 9e-5
     assert 0.1 < float((errors / found.devices.deviations).square().mean()) < 2.5
-    first, second = found.positions[0], found.positions[1]
+    first, second = found.positions[:2]
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
 
 
 @pytest.fixture(scope="module")
-def placed(arm: SimulatedArm, data: SocketReadings) -> Placed:
-    return place(arm.nominal, data, silent)
+def placed() -> Placed:
+    return place(ARM, DATA, silent)
 
 
-def test_places_left_out_by_leaving_them_out(data: SocketReadings, placed: Placed) -> None:
+def test_places_left_out_by_leaving_them_out(placed: Placed) -> None:
     """Closed form against a regression without the rows of the place."""
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
@@ -84,38 +64,35 @@ def test_places_left_out_by_leaving_them_out(data: SocketReadings, placed: Place
     socket, own = devices.device, devices.sockets.place[devices.device] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
-    gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
-    predicted = (
-        torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]] - tangent.target[gone]
-    )
-    torch.testing.assert_close(devices.left_out(chosen)[own], predicted, rtol=0, atol=1e-9)
+    gram = tangent.linearisation(scales).gram().view(len(DATA), 3, len(DATA), 3)
+    predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]]
+    assert_close(devices.left_out(chosen)[own], predicted - tangent.target[gone], rtol=0, atol=1e-9)
 
 
-def test_deviations_grow_where_places_contradict_each_other(data: SocketReadings, placed: Placed) -> None:
+def test_deviations_grow_where_places_contradict_each_other(placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
-    K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
-    for number in range(6):
-        own = (data.places == number).repeat_interleave(3)
+    K, r, total, count = covariance(tangent, scales), tangent.target.flatten(), 0.0, int(DATA.places.max()) + 1
+    for number in range(count):
+        own = (DATA.places == number).repeat_interleave(3)
         gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
         errors, spread = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
         total += float(errors @ torch.linalg.solve(spread, errors))
-    ratio = total / (3 * len(data) - 3 * 12)
+    ratio = total / (3 * len(DATA) - 3 * 2 * count)
     assert ratio > 1.5, "scales that are too small"
-    groups = data.groups()
-    factor = inflation_by_places(tangent, scales, data.places, data.device, groups)
-    assert factor == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
-    wide = defaults(tangent, 10 * found.noise, found.prior)
-    assert inflation_by_places(tangent, wide, data.places, data.device, groups) == region_factor(6, 3)
+
+    def factor(scales: dc.Hyperparameters) -> float:
+        return inflation_by_places(tangent, scales, DATA.places, DATA.device, DATA.groups())
+
+    assert factor(scales) == pytest.approx(ratio * region_factor(count, 3), rel=1e-5)
+    assert factor(defaults(tangent, 10 * found.noise, found.prior)) == region_factor(count, 3)
 
 
-def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: SocketRows) -> None:
-    names = arm.nominal.joint_names
-    wrong = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.051}, distance_std=3e-5)
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"differ") as caught:
-        result = dc.calibrate(arm.nominal, wrong, hyperparameters=scales())
-    (text,) = [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+def test_a_size_that_is_not_the_robots_is_warned_about() -> None:
+    wrong = with_attributes(DATA, distances=tuple((*own[:-1], 0.051) for own in DATA.distances), distance_std=3e-5)
+    result, texts = warned(dc.calibrate, ARM, wrong, hyperparameters=scales())
+    (text,) = [one for one in texts if "seems to differ" in one]
     assert re.match(r"the (distance of .*\(51.00 mm\)|size of the robot) seems to differ by \+", text), text
     assert result.lengths[0].value == pytest.approx(0.02, abs=0.006)
     assert result.expected.workspace > 3e-3

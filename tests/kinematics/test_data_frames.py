@@ -11,10 +11,10 @@ import torch
 from math_bank import constant_kernel
 from product_bank import Case
 from scipy.spatial.transform import Rotation
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError
 
 LIBRARIES = [pytest.param(pd.DataFrame, id="pandas"), pytest.param(pl.DataFrame, id="polars")]
 Table = Callable[[dict[str, Any]], Any]
@@ -60,25 +60,22 @@ def test_columns_are_taken_by_name(table: Table, arm: Case, posed: Case) -> None
 
 @pytest.mark.parametrize("table", LIBRARIES)
 def test_data_frames_that_cannot_be_taken(table: Table, arm: Case) -> None:
-    q, names = arm.test.q[:4], arm.robot.joint_names
-    columns = {name: q[:, k].numpy() for k, name in enumerate(names)}
+    names, model = arm.robot.joint_names, arm.model
+    columns = {name: arm.test.q[:4, k].numpy() for k, name in enumerate(names)}
     missing = table({name: columns[name] for name in names[:-1]} | {"last": columns[names[-1]]})
-    with pytest.raises(InputError, match=rf"has no column \['{names[-1]}'\]: expected columns .* got .*'last'"):
-        arm.model(missing)
-    with pytest.raises(MeasurementError, match="has no column"):
-        dc.Measurements(missing, arm.test.points[:4], names)
-    with pytest.raises(InputError, match=r"`q`: expected a data frame or an array, got Series"):
-        arm.model(table(columns)[names[0]])
-    with pytest.raises(InputError, match=f"column '{names[0]}' of the data frame `q` cannot be read as numbers"):
-        arm.model(table(columns | {names[0]: ["far"] * 4}))
-    with pytest.raises(InputError, match=r"6 value\(s\) that are not finite, the first at index \[1, 0\]"):
-        arm.model(table({name: [0.0, None] for name in names}))
-    kernel: Any = {"joint_kernel": constant_kernel(1.0), "task_kernel": constant_kernel(1.0)}
-    with pytest.raises(InputError, match="`x` is a data frame, but the inputs of this map have no names"):
-        dc.Problem(lambda x: x, table({"a": [0.0, 1.0]}), [[0.0], [1.0]], **kernel, noise=0.1)
-    twice = pd.DataFrame([[0.0] * 7], columns=pd.Index([*names, names[0]]))
-    with pytest.raises(InputError, match=f"has several columns named \\['{names[0]}'\\]"):
-        arm.model(twice)
+    words, gaps = table(columns | {names[0]: ["far"] * 4}), table({name: [0.0, None] for name in names})
+    twice: Any = pd.DataFrame([[0.0] * 7], columns=pd.Index([*names, names[0]]))
+    kernel: Any = {"joint_kernel": constant_kernel(1.0), "task_kernel": constant_kernel(1.0), "noise": 0.1}
+    plain = "`x` is a data frame, but the inputs of this map have no names"
+    refused(
+        (rf"has no column \['{names[-1]}'\]: expected columns .* got .*'last'", lambda: model(missing)),
+        ("has no column", lambda: dc.Measurements(missing, arm.test.points[:4], names)),
+        ("`q`: expected a data frame or an array, got Series", lambda: model(table(columns)[names[0]])),
+        (f"column '{names[0]}' of the data frame `q` cannot be read as numbers", lambda: model(words)),
+        (r"6 value\(s\) that are not finite, the first at index \[1, 0\]", lambda: model(gaps)),
+        (plain, lambda: dc.Problem(lambda x: x, table({"a": [0.0, 1.0]}), [[0.0], [1.0]], **kernel)),
+        (f"has several columns named \\['{names[0]}'\\]", lambda: model(twice)),
+    )
 
 
 def test_errors_of_every_row(pair: Case) -> None:
