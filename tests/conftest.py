@@ -27,6 +27,7 @@ from product_bank import (
     sliding_measurements,
     sliding_robot,
     ur10_measurements,
+    ur10_scales,
     usual_scales,
     with_usual_scales,
 )
@@ -173,4 +174,4 @@ def ur10_150(ur10_folder: Path) -> Case:
     train, test = data.split(0.7, seed=0)
     some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
     some = dc.Measurements(some.q, some.points)
-    return shared("ur10 150", lambda: Case(robot, some, test, dc.calibrate(robot, some)))
+    return shared("ur10 150", lambda: Case(robot, some, test, dc.calibrate(robot, some, hyperparameters=ur10_scales())))

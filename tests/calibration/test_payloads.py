@@ -70,7 +70,7 @@ def test_payloads_that_cannot_be(other: dc.Measurements) -> None:
 
     refused(
         ("calibrated with payloads, the measurements have none", lambda: dc.evaluate(loaded, other.with_payload(None))),
-        ("have payloads, the model was calibrated without", lambda: dc.evaluate(plain.model, plain.new.with_payload(3.0))),
+        ("the model was calibrated without", lambda: dc.evaluate(plain.model, plain.new.with_payload(3.0))),
         ("calibrated without payloads", lambda: plain.model.with_payload(3.0)),
         ("`mass` of the payload: expected a number of 0 or more, got -1", lambda: loaded.with_payload(-1.0)),
         ("expected a number of 0 or more", lambda: loaded.with_payload(10**400)),

@@ -53,8 +53,10 @@ def test_deviations_of_each_coordinate(arm: Case) -> None:
     draw = torch.from_numpy(np.random.default_rng(8).standard_normal((60, 1, 1)))
     points = arm.train.points + draw * torch.tensor([5e-4, 0.0, 0.0], dtype=torch.float64)
     scales = arm.result.selection.scales
-    given = dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points, std=std), hyperparameters=scales)
-    unknown = dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+    given, unknown = (
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points, std=own), hyperparameters=scales)
+        for own in (std, None)
+    )
     assert held_out(given, arm.test) < 0.8 * held_out(unknown, arm.test)
     noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2)
     assert float(noise[:, 0].min()) > 4e-4**2

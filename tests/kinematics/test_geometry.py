@@ -81,7 +81,7 @@ def test_wrong_input_is_explained(chain: Chain) -> None:
     geometry, q, eye = geometry_of(chain, 3), torch.zeros(2, 4), torch.eye(4)
     nominal, mimics = (
         Geometry.nominal(CHAIN),
-        r"expected \(7, 4, 4\), got \(3, 4, 4\); pass one .* `chain.moving_names`",
+        r"expected \(7, 4, 4\), got \(3, 4, 4\); pass one .* `chain.moving_names",
     )
     skew = torch.stack([eye, eye, 2 * eye, eye])
     refused(
