@@ -106,11 +106,11 @@ LONGEST = (
     *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
     *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_tool.py", "test_rigid.py"),
-    *("test_planned_sensors.py", "test_json_results.py"),
+    *("test_plan.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
-    *("test_refused.py", "test_second_device.py", "test_fit.py"),
-    *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_mixtures.py", "test_sessions.py"),
+    *("test_second_device.py", "test_fit.py"),
+    *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_set_ups.py"),
 )
 """File names, those of a quarter of a minute and more; all others follow in the usual order."""
 

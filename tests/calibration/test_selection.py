@@ -12,7 +12,7 @@ from kind_bank import kind_named
 from process_bank import case
 from product_bank import Case, noise_blocks
 from scipy.stats import chi2
-from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from tangent_bank import SETTINGS, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -81,7 +81,9 @@ def log_density(matrix: Tensor, target: Tensor) -> float:
     return float(-0.5 * (square + size + len(target) * np.log(2 * np.pi)))
 
 
-def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
+@pytest.mark.parametrize("name", SETTINGS)
+def test_posterior_is_likelihood_times_prior(name: str) -> None:
+    setting = built(name)
     scales, data = shaken(setting.scales, 2), weighted(setting, 2)
     nominal, theta, x = data.nominal.changed(rigid=True) if data.basis is not None else data.nominal, data.theta, data.x
     total = tangent_covariance(scales, nominal, theta, x)

@@ -1,9 +1,11 @@
-"""Campaigns in several set-ups: a device that was moved, markers mounted anew; found, judged, predicted, refused."""
+"""Campaigns in several set-ups, with markers mounted anew, or with payloads: found, judged, predicted, refused."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from kind_bank import kind_named
@@ -13,6 +15,9 @@ from table_bank import refused
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -114,3 +119,76 @@ def test_the_other_account_is_named_where_it_fits_far_better(said: bool) -> None
     with pytest.warns(dc.DiffeoCalibWarning) as caught:
         with_usual_scales(ARM.nominal, data.with_sessions(names, remounted=said))
     assert sum("--remounted" in str(one.message) for one in caught) == 1
+
+
+LADEN = kind_named("payloads")
+
+
+@pytest.fixture(scope="module")
+def other() -> dc.Measurements:
+    """True places of other configurations under payloads that were not measured."""
+    masses = torch.from_numpy(np.random.default_rng(1).choice([1.0, 6.0, 8.5], 200))
+    q = ARM.sample(200, seed=2)
+    return dc.Measurements(q, ARM.true_points(q, masses)).with_payload(masses)
+
+
+@pytest.mark.slow
+def test_masses_beyond_the_fit(other: dc.Measurements) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="a payload of 20 is beyond the 0 to 10 in the measurements of the fit"):
+        LADEN.model.with_payload(20.0)
+    with pytest.warns(DiffeoCalibWarning, match="a payload of 30 is beyond"):
+        dc.evaluate(LADEN.model, other.with_payload(30.0))
+    for mass in (np.int64(4), np.float32(4), torch.tensor(4.0)):
+        assert LADEN.model.with_payload(mass).payload == 4.0  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.slow
+def test_sag_under_other_payloads_is_predicted(other: dc.Measurements) -> None:
+    assert LADEN.result.fit.converged
+    without = with_usual_scales(ARM.nominal, LADEN.data.with_payload(None))
+    errors = dc.evaluate(LADEN.model, other).rms, dc.evaluate(without.model, other.with_payload(None)).rms
+    assert errors[0] < 0.5 * errors[1]
+    unknown = ARM.true_points(other.q, 10.0) - ARM.true_points(other.q, 0.0)
+    known = LADEN.model.with_payload(10.0)(other.q) - LADEN.model.with_payload(0.0)(other.q)
+    assert float((known - unknown).norm(dim=-1).mean()) < 0.25 * float(unknown.norm(dim=-1).mean())
+    assert {part.name: part.displacement for part in LADEN.result.parts}["payload"] > 1e-4
+
+
+@pytest.mark.slow
+def test_predicted_deviations_hold(other: dc.Measurements) -> None:
+    inside = []
+    for mass in (1.0, 6.0, 8.5):
+        own = other.payload == mass
+        mean, covariance = LADEN.model.with_payload(mass).predict(other.q[own], noise=False)
+        away = (other.points[own] - mean)[:, 0]
+        inside.append((away * torch.linalg.solve(covariance[:, 0], away)).sum(-1) < 7.815)  # 95 % of chi-squared, 3
+    assert float(torch.cat(inside).double().mean()) > 0.85
+
+
+@pytest.mark.slow
+def test_payloads_that_cannot_be(other: dc.Measurements) -> None:
+    rows, loaded, plain = LADEN.data, LADEN.model, kind_named("positions")
+
+    def calibrated(data: Any, **options: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(ARM.nominal, data, **options)
+
+    refused(
+        ("calibrated with payloads, the measurements have none", lambda: dc.evaluate(loaded, other.with_payload(None))),
+        ("the model was calibrated without", lambda: dc.evaluate(plain.model, plain.new.with_payload(3.0))),
+        ("calibrated without payloads", lambda: plain.model.with_payload(3.0)),
+        ("`mass` of the payload: expected a number of 0 or more, got -1", lambda: loaded.with_payload(-1.0)),
+        ("expected a number of 0 or more", lambda: loaded.with_payload(10**400)),
+        (r"expected 0 to 10 in .* of the fit, got 1e\+300; check its unit", lambda: loaded.with_payload(1e300)),
+        ("all payloads are 0", calibrated(rows.with_payload(0.0))),
+        ("`controls` of measurements with payloads: expected 'all', got 20", calibrated(rows, controls=20)),
+        (r"the link of the payload.*flange.*got wrist", calibrated(rows.with_payload(1.0, at="wrist"))),
+        ("row 1: expected a mass of 0 or more, got -2", lambda: rows[:2].with_payload([1.0, -2.0])),
+        ("payload", lambda: rows.with_payload([1.0, 2.0])),
+    )
+
+
+@pytest.mark.slow
+def test_one_payload_in_all_rows_is_warned_about() -> None:
+    q, points = ARM.measure(14, seed=4)
+    with pytest.warns(DiffeoCalibWarning, match="all rows carry the same payload"):
+        place(ARM.nominal, dc.Measurements(q, points).with_payload(6.0), silent).tangent_data()
