@@ -119,7 +119,7 @@ def make(**changes: object) -> Problem:
 
 
 def test_gradients_do_not_lead_back_to_the_data() -> None:
-    """Arrays and lists: tests/kinematics/test_unusual_kinds.py."""
+    """Arrays and lists: tests/kinematics/test_data_frames.py."""
     with pytest.warns(dc.DiffeoCalibWarning, match="back to `x`"):
         assert not make(x=X.clone().requires_grad_()).x.requires_grad
 
