@@ -1,4 +1,4 @@
-"""A robot by images of a printed board, alone and beside others: truth, scale, what changes between images, refusals."""
+"""A robot by images of a printed board, alone and beside others: truth, scale, changes between images, refusals."""
 
 from __future__ import annotations
 

@@ -49,13 +49,13 @@ def test_the_unit_of_length_does_not_matter() -> None:
 
     geometry = setting.nominal.geometry
     large = replace(data, nominal=Grown(geometry), theta=data.theta[: geometry.size], x=data.x * big)
-    grown = defaults(large, 10 * noise, prior)
-    assert_close(grown.coupled_lengthscale, setting.scales.coupled_lengthscale * big, rtol=1e-6, atol=0)
-    assert_close(grown.transmission_lengthscale, setting.scales.transmission_lengthscale * big, rtol=1e-6, atol=0)
-    assert_close(grown.task_lengthscale, 10 * setting.scales.task_lengthscale, rtol=1e-6, atol=0)
-    assert_close(grown.sensor_noise, 10 * setting.scales.sensor_noise, rtol=1e-6, atol=0)
+    grown, lengths = (
+        defaults(large, 10 * noise, prior),
+        dict.fromkeys(("coupled_lengthscale", "transmission_lengthscale"), big),
+    )
+    for name, factor in (lengths | {"task_lengthscale": 10, "sensor_noise": 10, "task_amplitude": 10}).items():
+        assert_close(getattr(grown, name), factor * getattr(setting.scales, name), rtol=1e-6, atol=0)
     assert_close(grown.rotation_noise, setting.scales.rotation_noise, rtol=1e-6, atol=0)
-    assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude, rtol=1e-6, atol=0)
     assert bool((grown.joint_noise > 0).all())
 
 
