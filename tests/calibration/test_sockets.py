@@ -46,15 +46,11 @@ KIND = kind_named("ball in sockets")
 ARM, DATA = KIND.robot, KIND.data
 
 
-def aligned(points: Tensor, truth: Tensor) -> Tensor:
-    """What remains of the errors of points (N, 3) after the best rigid motion."""
-    T = rigid_fit(points, truth)
-    return points @ T[:3, :3].mT + T[:3, 3] - truth
-
-
 def test_the_sockets_are_where_they_are() -> None:
     found, rows = KIND.result.sockets, rest_in_sockets(SimulatedArm(seed=0), seed=3, places=5, rows=6)
-    errors = aligned(found.positions, torch.stack([rows.positions[name] for name in found.names]))
+    truth = torch.stack([rows.positions[name] for name in found.names])
+    T = rigid_fit(found.positions, truth)
+    errors = found.positions @ T[:3, :3].mT + T[:3, 3] - truth
     assert float(errors.norm(dim=1).square().mean().sqrt()) < 9e-5
     assert 0.1 < float((errors / found.devices.deviations).square().mean()) < 2.5
     first, second = found.positions[:2]
