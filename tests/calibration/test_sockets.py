@@ -126,7 +126,8 @@ def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: obj
 
 def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
     bare: Any = {"distances": None, "distance_std": None}
-    ball = kind_named("ball in sockets")
+    tracked, resting = MIXED.source.rows.parts
+    few = dc.Measurements.joined([tracked.rows([0, 1]), resting])
 
     def staged(data: SocketReadings) -> Callable[[], object]:
         return lambda: place(plain.nominal, data, silent)
@@ -136,11 +137,12 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
             r"sockets: expected at least 2 rows with each name, got '2/1' in 1 row",
             staged(table(some).rows(slice(0, 31))),
         ),
+        ("9 unknowns .* expected at least 3 poses", staged(few)),
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
         ("rows with sockets: expected no sessions", lambda: table(some).with_sessions(["a"] * 18 + ["b"] * 18)),
-        ("expected 'flange', got 'hand'", lambda: dc.evaluate(ball.model, ball.new.with_tips(["hand"]))),
+        ("expected 'flange', got 'hand'", lambda: dc.evaluate(KIND.model, KIND.new.with_tips(["hand"]))),
         ("expected names alone", lambda: dc.Readings.of("socket", some.q, 0.0, some.names)),
         ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
         *(
@@ -247,21 +249,6 @@ def test_rows_of_another_robot() -> None:
     other = with_attributes(resting, q=resting.q + bend, distances=())
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
         place(MIXED.robot, dc.Measurements.joined([tracked, other]), silent)
-
-
-def test_refused() -> None:
-    def staged(*tables: Any) -> Callable[[], object]:
-        return lambda: place(MIXED.robot, dc.Measurements.joined(tables), silent)
-
-    tracked, resting = MIXED.source.rows.parts
-    large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
-    loaded = tracked.with_payload(1.0)
-    refused(
-        ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
-        ("positions seem to be 1000 times too large", staged(large, resting)),
-        ("the tables differ in payload", staged(loaded, resting)),
-        ("the tables differ in joint_names", staged(tracked, resting.with_joint_names(renamed))),
-    )
 
 
 def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
