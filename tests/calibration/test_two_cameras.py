@@ -14,7 +14,14 @@ import torch
 from command_bank import Command
 from kind_bank import Kind, kind_named
 from product_bank import usual_scales
-from simulated_camera import BOARD_PRIOR, CAMERA, CAMERA_BESIDE, CameraArm, fixed_camera_arm, images_of_both
+from simulated_camera import (
+    BOARD_PRIOR,
+    CAMERA,
+    CAMERA_BESIDE,
+    CameraArm,
+    fixed_camera_arm,
+    images_of_both,
+)
 from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close

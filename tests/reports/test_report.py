@@ -19,11 +19,9 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis import predictions
-from diffeo_calib.reports.analysis.findings import Findings, find
+from diffeo_calib.reports.analysis.findings import Deviations, Findings, find, repeats_of, stages_of
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
-from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
-from diffeo_calib.reports.html.sections import trust
-from diffeo_calib.reports.html.sentences import advice, figures, verdict
+from diffeo_calib.reports.html.sections import advice, figures, trust, verdict
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
