@@ -36,13 +36,13 @@ def in_this_process(command: Command) -> Callable[..., subprocess.CompletedProce
 @pytest.mark.usefixtures("undrawn", "given_scales")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run(example: Path, tmp_path: Path, command: Command) -> None:
-    """With at most 40 simulated rows, 121 configurations and 10 images, and given scales."""
+    """With at most 40 simulated rows, 121 configurations and 14 images, and given scales."""
     patch, measure, sample = command.monkeypatch.setattr, SimulatedArm.measure, SimulatedArm.sample
     seen, grid, calibrate = simulated_camera.camera_arm, elastic_rr.grid, dc.calibrate
     patch(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 40), seed))
     patch(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
     patch(elastic_rr, "grid", lambda count: grid(min(count, 11)))
-    patch(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 10)))
+    patch(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
     patch(dc, "calibrate", lambda robot, rows: calibrate(robot, rows, hyperparameters=usual_scales(robot)))
     patch(subprocess, "run", in_this_process(command))
     patch(sys, "argv", [str(example)])
