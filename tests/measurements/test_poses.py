@@ -14,7 +14,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.poses import (
     angle_between,
     directions_of_frames,
