@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from diffeo_calib.common.errors import DiffeoCalibWarning as DiffeoCalibWarning
     from diffeo_calib.fitting.fit import fit as fit
     from diffeo_calib.fitting.gauss_newton import GaussNewton as GaussNewton
-    from diffeo_calib.fitting.gradients import FitGradients as FitGradients
-    from diffeo_calib.fitting.gradients import fit_gradients as fit_gradients
     from diffeo_calib.fitting.lbfgs import LBFGS as LBFGS
     from diffeo_calib.fitting.problem import Problem as Problem
     from diffeo_calib.fitting.result import Fit as Fit

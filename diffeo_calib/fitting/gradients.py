@@ -12,7 +12,7 @@ and lambda is the limit of this iteration, which contracts where Gauss-Newton do
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,6 @@ from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.problem import linear_optimum
-from diffeo_calib.fitting.result import Fit
 from diffeo_calib.fitting.scales import rescaled
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 
@@ -42,21 +41,11 @@ class FitGradients(NamedTuple):
 
 @outside_inference_mode
 @torch.enable_grad()
-def fit_gradients(fit: Fit, x: object, loss: Callable[[Tensor], Tensor]) -> FitGradients:
-    """Derivatives of a loss of the fitted map by measurements, noise and scales, with the fit following them.
-
-    Args:
-        fit: a converged fit of the exact formulation, with all data as control points.
-        x: (M, n) configurations, rad or m.
-        loss: a torch function of k1(x) (M, m), m, to a scalar.
-
-    Raises:
-        InputError: another fit, x of the wrong shape, or a loss that is no scalar of its argument.
-        NumericalError: the iteration does not converge, since the fit did not, or is too far from linear.
-    """
-    if not isinstance(fit, Fit) or fit.formulation != "exact" or fit.problem.reduced or not fit.converged:
-        expected = "a converged fit of the exact formulation, with all data as control points"
-        raise InputError.of("`fit`", expected=expected, got=repr(fit))
+def gradients(fit: Any, x: object, loss: Callable[[Tensor], Tensor]) -> FitGradients:
+    """See :meth:`Fit.gradients`."""
+    if fit.formulation != "exact" or fit.problem.reduced or not fit.converged:
+        expected = "a converged one of the exact formulation, with all data as control points"
+        raise InputError.of("the fit", expected=expected, got=repr(fit))
     at = as_tensor(x, "x", ("M", fit.problem.x.shape[1])).detach()
     kernels = fit.problem.spec.joint_kernel, fit.problem.spec.task_kernel
     y = fit.problem.y.detach().requires_grad_()

@@ -112,7 +112,7 @@ class Problem:
         given = {"x": x, "y": y, "noise": noise, "prior_variance": prior_variance}
         if live := [name for name, value in given.items() if isinstance(value, Tensor) and value.requires_grad]:
             what = f"no gradient leads from a fit back to `{'`, `'.join(live)}`"
-            warn_user(sentence(what, fix="detach them, and use dc.fit_gradients"))
+            warn_user(sentence(what, fix="detach them, and use `fit.gradients`"))
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal, self.observe = as_nominal(nominal), observe

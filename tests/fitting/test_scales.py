@@ -151,7 +151,7 @@ def test_gradients_of_a_fit_are_those_of_other_fits(measured: str) -> None:
     def other(changed: dc.Problem) -> float:
         return float(loss(dc.fit(changed, solver, steps).model(new)))
 
-    found, small = dc.fit_gradients(fit, new, loss), 1e-4
+    found, small = fit.gradients(new, loss), 1e-4
     by_scales = torch.cat([found.prior[None], found.noise[None], found.joint_kernel, found.task_kernel])
     for gradient, changed in (
         (by_scales, lambda step: scales.rescaled(problem, step)),
@@ -163,6 +163,6 @@ def test_gradients_of_a_fit_are_those_of_other_fits(measured: str) -> None:
         torch.testing.assert_close(gradient[:8], y.new_tensor(differences), rtol=1e-4, atol=1e-5 * size)
     coarse = dc.fit(problem, integrator=steps, controls=5)
     refused(
-        ("`fit`: expected a converged fit", lambda: dc.fit_gradients(coarse, new, loss)),
-        ("`loss`: expected a differentiable scalar", lambda: dc.fit_gradients(fit, new, lambda values: values)),
+        ("the fit: expected a converged one", lambda: coarse.gradients(new, loss)),
+        ("`loss`: expected a differentiable scalar", lambda: fit.gradients(new, lambda values: values)),
     )
