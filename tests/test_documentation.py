@@ -1,19 +1,20 @@
 """Commands and snippets of README and site run, on files of the names that they use; links lead somewhere."""
 
+import os
 import re
-import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_bank import Command
 from documentation_bank import commands, shown_outputs, words, write_tables
-from product_bank import usual_scales, with_usual_scales
+from product_bank import with_usual_scales
 from typer import Context
 from typer.main import get_command
 
-import diffeo_calib as dc
 from diffeo_calib.cli.main import app
 
 ROOT = Path(__file__).parents[1]
@@ -68,14 +69,12 @@ def test_options_of_pages_that_run_elsewhere_are_known(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_snippets_run_one_after_the_other(folder: Path, command: Command) -> None:
-    code, calibrate = dict.fromkeys(snippet for text in texts().values() for snippet in snippets(text)), dc.calibrate
-    (folder / "snippets.py").write_text("\n".join(code), encoding="utf-8")
-    given = lambda robot, *rows, **how: calibrate(robot, *rows, **{"hyperparameters": usual_scales(robot)} | how)  # noqa: E731
-    command.monkeypatch.setattr(dc, "calibrate", given)
-    command.monkeypatch.chdir(folder)
-    runpy.run_path("snippets.py", run_name="__main__")
-    assert command.capsys.readouterr().out.count("converged") >= 2
+def test_snippets_run_one_after_the_other(folder: Path) -> None:
+    code = "\n".join(dict.fromkeys(snippet for text in texts().values() for snippet in snippets(text)))
+    words, env = [sys.executable, "-W", "error", "-c", code], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300, env=env, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("converged") >= 2
 
 
 @pytest.mark.filterwarnings("ignore:the place of the marker on 'tool0' along")  # the tool's x axis is always vertical

@@ -16,6 +16,7 @@ import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm, elastic_rr
 
 ROOT = Path(__file__).parents[2]
+GIVEN: Callable[[dc.Tree], dict[str, Any]] = lambda robot: {"hyperparameters": usual_scales(robot)}  # noqa: E731
 EXAMPLES = sorted((ROOT / "scripts" / "examples").glob("*.py"))
 
 
@@ -43,7 +44,7 @@ def test_examples_run(example: Path, tmp_path: Path, command: Command) -> None:
     patch(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
     patch(elastic_rr, "grid", lambda count: grid(min(count, 11)))
     patch(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
-    patch(dc, "calibrate", lambda robot, rows: calibrate(robot, rows, hyperparameters=usual_scales(robot)))
+    patch(dc, "calibrate", lambda robot, *rows, **how: calibrate(robot, *rows, **GIVEN(robot) | how))
     patch(subprocess, "run", in_this_process(command))
     patch(sys, "argv", [str(example)])
     command.monkeypatch.chdir(tmp_path)
