@@ -16,7 +16,6 @@ import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm, elastic_rr
 
 ROOT = Path(__file__).parents[2]
-GIVEN: Callable[[dc.Tree], dict[str, Any]] = lambda robot: {"hyperparameters": usual_scales(robot)}  # noqa: E731
 EXAMPLES = sorted((ROOT / "scripts" / "examples").glob("*.py"))
 
 
@@ -40,11 +39,15 @@ def test_examples_run(example: Path, tmp_path: Path, command: Command) -> None:
     """With at most 40 simulated rows, 121 configurations and 14 images, and given scales."""
     patch, measure, sample = command.monkeypatch.setattr, SimulatedArm.measure, SimulatedArm.sample
     seen, grid, calibrate = simulated_camera.camera_arm, elastic_rr.grid, dc.calibrate
+
+    def given(robot: dc.Tree, *rows: Any, **how: Any) -> Any:
+        return calibrate(robot, *rows, **{"hyperparameters": usual_scales(robot)} | how)
+
     patch(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 40), seed))
     patch(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
     patch(elastic_rr, "grid", lambda count: grid(min(count, 11)))
     patch(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
-    patch(dc, "calibrate", lambda robot, *rows, **how: calibrate(robot, *rows, **GIVEN(robot) | how))
+    patch(dc, "calibrate", given)
     patch(subprocess, "run", in_this_process(command))
     patch(sys, "argv", [str(example)])
     command.monkeypatch.chdir(tmp_path)
