@@ -20,7 +20,6 @@ from diffeo_calib.calibration.placing.readings import ReadingDevices, SocketDevi
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
-from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -88,13 +87,6 @@ class CalibrationResult:
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
-
-    def _repr_html_(self) -> str:
-        """The model and what it explains, for notebooks."""
-        rows = [[part.name, f"{1e3 * part.displacement:.4f}"] for part in self.parts]
-        words = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
-        parts = table_html(f"{self.status}; {words}", ("part", "displacement [mm]"), rows)
-        return self.model._repr_html_() + parts
 
     @property
     def registration(self) -> Identification:

@@ -206,10 +206,6 @@ class Process(Conditional):
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
-    def with_effects(self, unknowns: Tensor, E: Tensor) -> Process:
-        """Rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
-        return replace(self, factor=self.factor.with_features(unknowns, E))
-
     def features(self, at: Linearisation) -> Features:
         before = self.before.features(at)
         cross = self.numbers.gram(at).addmm_(self.known, before.known, alpha=-1.0)

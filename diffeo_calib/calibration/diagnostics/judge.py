@@ -320,7 +320,7 @@ def other_payloads(
     E = some.motions_in_numbers(some.slopes @ full.sensitivities(some.x, some.theta)[..., loaded]) * sizes
 
     def under(codes: Tensor, factor: float) -> Process:
-        return rows.process.with_effects(loaded, factor * rows.columns(E, codes))
+        return replace(rows.process, factor=rows.process.factor.with_features(loaded, factor * rows.columns(E, codes)))
 
     columns = {"": masses} | dict(_other_columns(masses, lines))
     codes = {words: other[rows.index] / float(other.max()) for words, other in columns.items()}

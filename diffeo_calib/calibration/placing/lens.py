@@ -109,6 +109,7 @@ class LensAndBoard(CameraErrors):
         larger: how much longer lengths in the images are than those of the robot, as a share.
     """
 
+    size_advice = "measure the printed squares with a caliper and give `images --board-std`"
     lever: float
     apart: Tensor
     larger: float
@@ -220,9 +221,6 @@ class LensAndBoard(CameraErrors):
                 "board's size explains them as well, until its squares are measured"
             )
         return lines
-
-    def size_advice(self) -> str:
-        return "measure the printed squares with a caliper and give `images --board-std`"
 
     def entry(self) -> dict[str, object]:
         entries = {

@@ -178,7 +178,7 @@ class Placed:
             fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
         """
         here = torch.eye(4, dtype=chosen.data.y.dtype, device=chosen.data.y.device)
-        placement = self.placement.settled(fitted, fitted_map, chosen.data, here, chosen=chosen)
+        placement = self.placement.settled(fitted, fitted_map, chosen.data, here)
         aligned = self.coordinates
         if aligned is not None:
             aligned = aligned._replace(table=with_markers(aligned.table, self.registration.geometry.markers))

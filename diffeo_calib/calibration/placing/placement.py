@@ -11,12 +11,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
@@ -66,7 +65,6 @@ class Settled(NamedTuple):
     # model
     centre: Tensor
     transform: Tensor
-    chosen: ChosenScales | None = None  # scales, and the rows with their weights; None of a recalibration
     known: SetUps | None = None  # what the old model knew of the tool in each set-up; None of a calibration
 
 
@@ -74,6 +72,8 @@ class Settled(NamedTuple):
 class DeviceSet(ABC):
     """Devices of one kind in a calibration."""
 
+    size_advice: ClassVar[str] = ""
+    """What would make the robot's size better known; nothing where these devices have a size of their own."""
     # where they are, and their rows; before a fit the deviations of their increments are those of the prior
     devices: Extrinsics
 
@@ -120,10 +120,6 @@ class DeviceSet(ABC):
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
-
-    def size_advice(self) -> str:
-        """What would make the robot's size better known; nothing where these devices have a size of their own."""
-        return ""
 
     def hypotheses(self, data: Seen) -> Iterable[Hypothesis]:
         """What of these devices may change during the measurements, or be wrong, with effects (N, R, U) on all rows."""

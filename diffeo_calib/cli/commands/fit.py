@@ -127,7 +127,7 @@ def _lines_about_places(
     if _of_positions(held_out):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)
     yield from printed.expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (device.size_advice() for device in result.placement)), None)
+    advice = next(filter(None, (device.size_advice for device in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
