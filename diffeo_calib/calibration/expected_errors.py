@@ -124,9 +124,7 @@ class ExpectedError:
 
 
 def expected_errors(
-    model: CalibratedKinematics,
-    stages: Mapping[str, Callable[[Tensor], Tensor]],
-    expected: ExpectedError | None = None,
+    model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]], expected: ExpectedError | None = None
 ) -> dict[str, float]:
     """Root mean square distances, m, of the positions of every stage from the true ones, by stage.
 

@@ -305,11 +305,7 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
 def other_payloads(
     rows: SampledRows, some: TangentData, data: TangentData, scales: Hyperparameters, lines: Tensor
 ) -> Iterator[Candidate]:
-    """Payloads that would explain the rows far better than their own.
-
-    Args:
-        rows, some: those that are judged, and their measurements. data, lines: all rows, and theirs in their file.
-    """
+    """Payloads that would explain the rows far better than their own."""
     load, sag = data.nominal.load, data.nominal.elasticity
     if not load.by_row or sag is None:
         return

@@ -164,12 +164,7 @@ class Placement(tuple[DeviceSet, ...]):
         return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(part.effects(data) for part in self)], 2)
 
     def settled(self, fitted: Fit, around: FittedMap, data: Seen, transform: Tensor, **known: Any) -> Placement:
-        """Move the devices to where a fit puts them; its last shifts are theirs.
-
-        Args:
-            fitted: the fit. around: its map, with the covariances of the model. data: its rows.
-            transform, known: see :class:`Settled`.
-        """
+        """Move the devices to where a fit puts them; its last shifts are theirs."""
         sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [devices.effects(data).shape[2] for devices in self]
         centre = data.points.unflatten(1, (-1, 3)).mean((0, 1))
         first, numbers = len(around.geodesic.spec.prior_variance), torch.arange(len(shifts), device=shifts.device)

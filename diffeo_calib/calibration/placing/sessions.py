@@ -32,14 +32,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.known_drift import OFFSETS, KnownDrift
-from diffeo_calib.sensors.set_ups import (
-    MeasuringFrames,
-    MountedMarkers,
-    SetUps,
-    frame_slopes,
-    sessions_of,
-    set_up_kind,
-)
+from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedMarkers, SetUps, frame_slopes, sessions_of, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates
 
 ROUNDS = 3
