@@ -37,7 +37,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.regression.conditional import diagonal_blocks, roots
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.tables import device_coordinates
+from diffeo_calib.sensors.kinds import device_coordinates
 
 
 def stands_free(model: CalibratedKinematics) -> bool:

@@ -15,9 +15,8 @@ from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import Placed
-from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.placement import Placement, Sessions
 from diffeo_calib.calibration.placing.readings import ReadingDevices, SocketDevices
-from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.fitting.result import Fit
@@ -29,7 +28,7 @@ from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.sensors.coordinates import Places, joined
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.tables import with_positions
+from diffeo_calib.sensors.kinds import with_positions
 
 STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 """The stages of a calibration: base and markers only, with an error of every joint, and the model."""

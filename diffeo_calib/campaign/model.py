@@ -39,8 +39,8 @@ from diffeo_calib.regression.conditional import Features, Process, diagonal_bloc
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, Hypothesis
+from diffeo_calib.sensors.kinds import rows_of_one_kind
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import rows_of_one_kind
 
 MOST_COORDINATES = 4500  # measured numbers of a posterior: of more rows a random sample stands for all
 EXCEEDANCE_PROBABILITY = 0.05  # probability that the true error is above its limit

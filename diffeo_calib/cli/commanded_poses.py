@@ -28,7 +28,7 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
-from diffeo_calib.sensors.tables import measured_positions
+from diffeo_calib.sensors.kinds import measured_positions
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""

@@ -13,9 +13,9 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
+from diffeo_calib.regression.linear_rows import Evidence
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:

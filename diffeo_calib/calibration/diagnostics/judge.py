@@ -29,9 +29,9 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.linear_rows import Evidence
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Hypothesis
 

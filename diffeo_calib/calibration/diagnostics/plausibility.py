@@ -42,7 +42,7 @@ from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import joint_name_fix
 from diffeo_calib.sensors.devices import check_devices
-from diffeo_calib.sensors.tables import sees_frame
+from diffeo_calib.sensors.kinds import sees_frame
 
 
 def check_joints(robot: Tree, data: Any) -> None:

@@ -11,8 +11,15 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
-from diffeo_calib.calibration.placing.sessions import Sessions
+from diffeo_calib.calibration.placing.placement import (
+    DeviceSet,
+    Elsewhere,
+    OtherRows,
+    Placement,
+    Seen,
+    Sessions,
+    Settled,
+)
 from diffeo_calib.cameras.board import LENS, BoardPrior
 from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user

@@ -38,9 +38,8 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.lens import BoardSize, LensAndBoard
-from diffeo_calib.calibration.placing.placement import Elsewhere, OtherRows, Placement
+from diffeo_calib.calibration.placing.placement import Drift, Elsewhere, OtherRows, Placement, Sessions
 from diffeo_calib.calibration.placing.readings import ReadingDevices, ball_of, reading_sets, register_ball, resting_rows
-from diffeo_calib.calibration.placing.sessions import Drift, Sessions
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
@@ -57,7 +56,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.tables import Coordinates, ball_tip, check_poses, divided, sees_frame, with_markers
+from diffeo_calib.sensors.kinds import Coordinates, ball_tip, check_poses, divided, sees_frame, with_markers
 
 
 class Told(NamedTuple):

@@ -42,9 +42,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import fitting_devices
 from diffeo_calib.sensors.devices import VALUE, Devices, Hypothesis, check_devices
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.kinds import OtherReadings, kind_of
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import OtherReadings
 from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
 

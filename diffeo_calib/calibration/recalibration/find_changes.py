@@ -37,8 +37,8 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
+from diffeo_calib.regression.linear_rows import Evidence
 
 LEVEL = 0.01  # probability that anything is named although nothing has changed
 

@@ -39,7 +39,7 @@ from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.devices import CHANGE
-from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.kinds import Coordinates
 
 FREE = ("both", "base", "marker")
 MARKER_DEVIATIONS = {

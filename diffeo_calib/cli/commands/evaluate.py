@@ -32,13 +32,15 @@ from diffeo_calib.kinematics.evaluation import (
     place,
     placement_sentences,
     positions_of,
+    refuse_other_angles,
+    repeated_lines,
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
     unseen,
+    warn_outside_range,
 )
 from diffeo_calib.kinematics.hand_eye import IN_TIP, HandEye
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions

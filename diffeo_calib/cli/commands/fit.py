@@ -32,7 +32,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.kinds import divided
 
 EXIT_UNCONVERGED = 3
 LARGE_SHARE = 0.5  # of the expected error, from which the robot's size is said to be worth measuring

@@ -18,7 +18,7 @@ from diffeo_calib.cli.printed import frame_lines, motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
+from diffeo_calib.kinematics.evaluation import repeated_lines, warn_outside_range
 from diffeo_calib.measurements.bodies import placement_lines
 
 MARKERS: dict[str | None, Any] = {None: "evidence", "base": "same", "remounted": "moved", "both": "other"}

@@ -31,7 +31,7 @@ from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, fore
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions
+from diffeo_calib.sensors.kinds import divided, measured_positions
 
 LOG = logging.getLogger(__name__)
 STEPS = 4  # of the analysis, as they are told
