@@ -36,8 +36,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, MeasurementError, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES
-from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
+from diffeo_calib.measurements.csv.columns import Columns, JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE

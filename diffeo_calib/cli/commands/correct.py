@@ -10,10 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
+from diffeo_calib.cli.console import out, plain, progress_bar, record, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import as_written, of_robot, table_format, targets_of, with_rotation
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
