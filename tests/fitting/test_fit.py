@@ -43,10 +43,6 @@ def test_backend_is_an_argument_and_reported() -> None:
     small = ("fused", "fused") if not FUSED.trouble() else ("dense", "dense")
     assert fits["auto"].backend == small
     torch.testing.assert_close(fits["tiled"].energy, fits["dense"].energy, rtol=1e-8, atol=0)
-    with pytest.raises(
-        InputError, match="`backend`: expected auto, dense, fused, tiled, keops, distributed, got 'gpu'"
-    ):
-        dc.fit(problem, backend="gpu")  # pyright: ignore[reportArgumentType]
 
 
 def test_integrator_of_the_solver() -> None:
@@ -104,22 +100,6 @@ def test_arguments_of_the_wrong_kind_are_one_sentence() -> None:
         (bad, controls("all")),
         (rf"{bad} \(booleans\)", controls(True)),
     )
-
-
-@pytest.mark.slow
-def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
-    fit = dc.fit(small.problem)
-    assert fit.integrator.intervals in (1, 2, 4, 8)
-    assert fit.step_error <= 0.01 * 0.01
-    assert fit.end_residual <= 0.05
-    assert fit.energy == pytest.approx(small.energy, rel=1e-4)
-    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the previous fit
-    coarse, fine = (dc.fit(rr_problem(4, noise=sigma)).integrator for sigma in (0.3, 0.003))
-    assert isinstance(coarse, dc.RK4)
-    assert isinstance(fine, dc.RK8)
-    stopped = dc.fit(rr_problem(4, noise=0.1), dc.LBFGS(max_iterations=5))
-    assert "limit of 5 iterations" in stopped.status
-    assert stopped.integrator.intervals <= 2, "before the optimum, the end residual does not measure the time steps"
 
 
 def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:

@@ -20,6 +20,18 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.robots import elastic_rr
 
 
+@pytest.fixture(scope="module")
+def small() -> Fit:
+    """An 8 x 8 grid: quick to fit, and deformed as much as the paper's."""
+    return dc.fit(rr_problem(8), dc.GaussNewton(), dc.RK4(2))
+
+
+@pytest.fixture(scope="module")
+def fine(small: Fit) -> Fit:
+    """The same problem with finer time steps."""
+    return dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
+
+
 def test_one_point_in_closed_form() -> None:
     """One measurement: straight geodesics, and a quadratic energy when k0 is linear."""
     matrix, offset, sigma = tensor([[1.0, 0.4], [-0.3, 0.8]]), tensor([0.2, -0.1]), 0.1
@@ -177,6 +189,22 @@ def test_the_optimum_is_the_same_after_fewer_iterations(monkeypatch: pytest.Monk
     assert mixed.converged
     assert mixed.iterations < plain.iterations
     assert mixed.energy == pytest.approx(plain.energy, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_default_integrator_is_fine_enough(small: Fit) -> None:
+    fit = dc.fit(small.problem)
+    assert fit.integrator.intervals in (1, 2, 4, 8)
+    assert fit.step_error <= 0.01 * 0.01
+    assert fit.end_residual <= 0.05
+    assert fit.energy == pytest.approx(small.energy, rel=1e-4)
+    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the previous fit
+    coarse, fine = (dc.fit(rr_problem(4, noise=sigma)).integrator for sigma in (0.3, 0.003))
+    assert isinstance(coarse, dc.RK4)
+    assert isinstance(fine, dc.RK8)
+    stopped = dc.fit(rr_problem(4, noise=0.1), dc.LBFGS(max_iterations=5))
+    assert "limit of 5 iterations" in stopped.status
+    assert stopped.integrator.intervals <= 2, "before the optimum, the end residual does not measure the time steps"
 
 
 @pytest.fixture(scope="module")
