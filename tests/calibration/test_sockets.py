@@ -185,10 +185,6 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
-    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 2 rows repeat an earlier row"):
-        dc.Measurements.from_sockets(some.q[[0, 0]], ["a", "b"])
-    with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
-        table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
     known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
     assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]

@@ -125,7 +125,7 @@ def in_other_unit(rows: Any, factor: float) -> Any:
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(math.pi / 180, "radians"), (180 / math.pi, "degrees")])
-@pytest.mark.parametrize("name", marked("ball in sockets", "positions", "heights", "several kinds"))
+@pytest.mark.parametrize("name", marked("ball in sockets", "positions", "heights"))
 def test_rows_in_another_unit_of_angles_are_named(name: str, factor: float, unit: str) -> None:
     """Refused; small values of some joints lie in the ranges of the fit, too, and are warned of."""
     kind = kind_named(name)
