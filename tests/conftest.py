@@ -90,7 +90,7 @@ def browser() -> Iterator[Any]:
 
 BY_KIND = (
     *("test_matrix.py", "test_kinds_judged.py", "test_init.py", "test_live_campaign.py", "test_expected_errors.py"),
-    *("test_registered_kinds.py", "test_predicted_readings.py", "test_laws_of_kinds.py", "test_golden.py"),
+    *("test_registered_kinds.py", "test_laws_of_kinds.py", "test_golden.py"),
 )
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (

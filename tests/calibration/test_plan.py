@@ -248,10 +248,7 @@ def test_a_camera_measures_what_it_sees() -> None:
         dc.plan(arm.nominal, q, 100, sensor=sensor)
 
 
-AGAIN = ("heights", "mixture", "several kinds", "two cameras on the tool")
-
-
-@pytest.mark.parametrize("name", marked(*AGAIN))
+@pytest.mark.parametrize("name", marked("heights", "mixture", "two cameras on the tool"))
 def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) -> None:
     """The devices under their names; no place on the tool is open that no row of the registration could tell."""
     kind = kind_named(name)

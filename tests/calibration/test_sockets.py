@@ -16,10 +16,8 @@ from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused, warned
 from tangent_bank import covariance
 from torch import Tensor
-from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.identification.identification import (
     KindRows,
@@ -29,9 +27,8 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices
-from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
-from diffeo_calib.calibration.scales.selection import Selection, defaults
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.readings import SocketReadings
@@ -60,19 +57,6 @@ def test_the_sockets_are_where_they_are() -> None:
 @pytest.fixture(scope="module")
 def placed() -> Placed:
     return place(ARM, DATA, silent)
-
-
-def test_places_left_out_by_leaving_them_out(placed: Placed) -> None:
-    """Closed form against a regression without the rows of the place."""
-    tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
-    scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
-    chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    socket, own = devices.device, devices.sockets.place[devices.device] == 2
-    rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
-    mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
-    gram = tangent.linearisation(scales).gram().view(len(DATA), 3, len(DATA), 3)
-    predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]]
-    assert_close(devices.left_out(chosen)[own], predicted - tangent.target[gone], rtol=0, atol=1e-9)
 
 
 def test_deviations_grow_where_places_contradict_each_other(placed: Placed) -> None:
@@ -201,10 +185,6 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
-    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 2 rows repeat an earlier row"):
-        dc.Measurements.from_sockets(some.q[[0, 0]], ["a", "b"])
-    with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
-        table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
     known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
     assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]

@@ -24,15 +24,21 @@ FIT = (
 )
 
 
-def test_columns_and_units_of_the_fit_unless_typed() -> None:
+def test_columns_and_units_of_the_fit() -> None:
     units = Rows(length="mm", angle="deg", sep=";")
     rows = replace(units, position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
     assert as_at_the_fit(FIT, Rows()) == rows
     assert as_at_the_fit(FIT, Units()) == Units(length="mm", angle="deg", sep=";")
+
+
+def test_typed_options_win() -> None:
     rows = as_at_the_fit(FIT, Rows(session="night", angle="rad"))
     assert (rows.session, rows.std, rows.angle, rows.length) == ("night", "s", "rad", "mm")
     whole = Rows(position=["x,y,z"], length="m", angle="rad")
     assert as_at_the_fit(FIT, whole) == whole, "what states both units describes the whole format"
+
+
+def test_units_are_never_guessed() -> None:
     for command, missing in (("", "--length and --angle missing"), ("diffeo-calib fit --length m", "--angle missing")):
         with pytest.raises(InputError, match=missing):
             table_format(as_at_the_fit(command, Rows(position=["x,y,z"])))
@@ -40,7 +46,9 @@ def test_columns_and_units_of_the_fit_unless_typed() -> None:
         table_format(Units(length="m"))
 
 
-@pytest.mark.parametrize("words", ["--position 'x,y,z", "--position", "--lever long --angle deg", "--angle=turns"])
+@pytest.mark.parametrize(
+    "words", ["--position 'x,y,z", "--position", "--length furlong", "--lever long --angle deg", "--angle=turns"]
+)
 def test_options_that_are_none_are_one_error(words: str) -> None:
     """Whoever sends a model file may have edited the line in it."""
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm {words}"
@@ -65,7 +73,8 @@ def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypat
 def test_model_and_table_are_enough(site: Site, sound_path: Path, command: Command, tmp_path: Path) -> None:
     model, out, results = site.folder / "model.safetensors", tmp_path / "out.json", list[object]()
     for options in ([], TABLE):
-        done = command.ran("evaluate", model, site.csv, *options, "--json", out)
+        done = command("evaluate", model, site.csv, *options, "--json", out)
+        assert done.code == 0, done.err
         assert ("read as at the fit: --position mx,my,mz" in done.out) == (not options)
         results.append(json.loads(out.read_text())["results"])
     assert results[0] == results[1]
@@ -75,7 +84,8 @@ def test_model_and_table_are_enough(site: Site, sound_path: Path, command: Comma
         (["plan", model, "-n", 2, "--draw", 10, "--joints", "A,B,C,D,E,F"], "A;B;C;D;E;F;rank"),
         (["correct", model, site.csv], joints),  # programs are read in the units of the fit
     ):
-        done = command.ran(*words, "-o", tmp_path / "o.csv")
+        done = command(*words, "-o", tmp_path / "o.csv")
+        assert done.code == 0, done.err
         assert (tmp_path / "o.csv").read_text().startswith(header)
     for words in (["evaluate", sound_path, site.csv], ["correct", sound_path, site.csv, "-o", tmp_path / "c.csv"]):
         assert "--length and --angle missing" in command(*words).error
@@ -100,8 +110,10 @@ UNITS = Rows(length="mm", angle="deg")
 
 
 def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
-    kinds: Any = {"reading": ["distance=wire", "image=u,v,9,9,1,1"], "socket": "place,socket", "distance": ["0,1=50"]}
-    rows = replace(UNITS, position=["x,y,z"], session="day", distance_std=0.03, **kinds)
+    rows = replace(
+        UNITS, position=["x,y,z"], reading=["distance=wire", "image=u,v,9,9,1,1"], socket="place,socket", session="day"
+    )
+    rows = replace(rows, distance=["0,1=50"], distance_std=0.03)
     path = tmp_path / "t.csv"
     path.write_text("q1,x,y,z\n1,2,3,4\n")
     found, missing = rows_in_table(path, rows)

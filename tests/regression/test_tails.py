@@ -47,9 +47,10 @@ def log_posterior(errors: Tensor, freedom: float, scale: float) -> float:
 
 
 @pytest.mark.parametrize("dim", [1, 3, 6])
-def test_no_other_freedom_is_more_likely(dim: int) -> None:
+@pytest.mark.parametrize("count", [6, 80])
+def test_no_other_freedom_is_more_likely(dim: int, count: int) -> None:
     """And the weights are those of the formula."""
-    errors = simulated(80, dim, 4.0, seed=dim)
+    errors = simulated(count, dim, 4.0, seed=dim)
     squares = errors.square().sum(1, keepdim=True)
     found = reweight(squares, dim)
     best = log_posterior(errors, found.freedom, 1.0)
