@@ -30,7 +30,6 @@ ROWS_LOOKED_AT = 50
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
-
 DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
 NAMED = {
     "session": ("session setup station anchor device plane", "the device, or its set-up, of every row"),

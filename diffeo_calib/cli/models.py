@@ -161,7 +161,6 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
 
 LONGEST_TOOL_PER_REACH = 5.0  # from where a tool is refused: its unit is wrong
 
-
 MEASURED = "measured:"  # before the numbers of a tool in the measured frame
 
 

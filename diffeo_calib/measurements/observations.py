@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
+from diffeo_calib.measurements.checks import chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
 
 WITH_POSITION = ("position", "pose")  # kinds of rows of which a device measures positions
@@ -72,13 +72,6 @@ class Observations(RowGroups):
         """The rows of several tables in order, see :meth:`Measurements.joined`."""
         return joined_tables(parts, apart=True)
 
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the file that the rows were read from, or of the parts."""
-        rows = {f"index {k}": numbers for k, numbers in enumerate(self.index)}
-        parts = {f"part {k}": part.sha256.encode() for k, part in enumerate(self.parts)}
-        return self.file_sha256 or arrays_sha256(rows, parts)
-
     device_names, row_names, places, socket_numbers = map(_column, NUMBERED)
 
     @property
@@ -101,11 +94,6 @@ class Observations(RowGroups):
     def without_device(self) -> bool:
         """Whether neither a position nor a pose was measured."""
         return not any(part.kind in WITH_POSITION for part in self.parts)
-
-    def __repr__(self) -> str:
-        counts = (len(self), "row"), (self.n, "joint")
-        words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-        return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
 
     def to_frame(self) -> Any:
         """See :meth:`RowGroups.to_frame`; the first column is kind, and cells of other kinds are NaN."""

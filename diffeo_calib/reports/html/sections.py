@@ -315,7 +315,6 @@ WORTHWHILE_ERROR_FACTOR = 1.1
 ENOUGH_FOR_P95 = 20  # rows from which a 95th percentile means something
 BAD_RATIO = 1.5  # ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named
 
-
 MISCALIBRATION_PROBABILITY = 0.05
 """Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""
 
