@@ -144,7 +144,6 @@ def entries_by_kind(errors: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _each(errors: Any, entry: Callable[[Evaluation], dict[str, Any]]) -> Any:
-    """The entry of every evaluation of a tree."""
     return {name: _each(part, entry) for name, part in errors.items()} if isinstance(errors, Mapping) else entry(errors)
 
 

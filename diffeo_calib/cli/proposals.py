@@ -434,9 +434,8 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual = " or ".join(dict.fromkeys(body.usual for body in turned))
         names = [name for body in turned for name in body.turn]
-        remark = f"{few(names, 9)}: {what}; not used; such names usually mean {usual}"
+        remark = f"{few(names, 9)}: {what}; not used"
         return source if camera else source.remarking(remark)
     why = {"convention": reason(*ways)}
     if camera:

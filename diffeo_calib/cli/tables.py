@@ -108,19 +108,24 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, given: Given) -> Given:
+def as_at_the_fit(command: str, given: Given, csv: Path | None = None) -> Given:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
-    unless both --length and --angle are.
+    unless both --length and --angle are. Marks are then those of the fit too if the file has more columns with them.
 
     Args:
-        command: that made the model, or the options of its table alone; empty where neither is known.
+        command: that made the model, or the options of its table alone; empty where neither is known. csv: the file.
     """
     wanted, marker = given.left_open(), given.marker if isinstance(given, Rows) else None
     wanted -= {name for name, value in vars(given).items() if value}
     try:
-        stored = shlex.split(command) if wanted or marker else []
+        stored = shlex.split(command)
+        marks = _stated(stored, {"sep", "decimal"} - {name for name, value in vars(given).items() if value})
+        if csv is not None and csv.is_file() and "sep" in marks and not wanted & {*marks}:
+            like = replace(given, **{name: value for name, (value, _) in marks.items()})
+            widths = [len(CsvLines(csv, table_format(units).sep).header) for units in (given, like)]
+            wanted |= {*marks} if widths[1] > widths[0] else set()
         if marker is not None and "=" not in marker:
             order = _stated(stored, {"marker"}).get("marker", ("", []))[0].partition("=")[1:]
             given = replace(given, marker=marker + "".join(order))

@@ -173,7 +173,6 @@ def read_images(bag: Path, topic: str, times: Collection[float]) -> Iterator[tup
 
 
 def _png(message: Any, content: bytes, topic: str) -> bytes:
-    """A sensor_msgs/Image as a file."""
     if message.encoding not in CHANNELS:
         expected = f"one of {few([*CHANNELS])}"
         raise MeasurementError.of(f"the encoding of images of {topic}", expected=expected, got=message.encoding)
@@ -187,7 +186,6 @@ def _png(message: Any, content: bytes, topic: str) -> bytes:
 
 
 def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterator[tuple[str, Any]]:
-    """Topic and content of the messages of some topics."""
     try:
         from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
@@ -212,7 +210,6 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
 
 
 def _time(message: Any, topic: str) -> float:
-    """Time of the header, s."""
     header = getattr(message, "header", None)
     if header is None:
         fix = "record the stamped kind of message"

@@ -182,7 +182,6 @@ def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str
 
 
 def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, usual: tuple[int, ...]) -> Seen:
-    """The board in an image, or why there is none."""
     nothing, pixels, refused = np.zeros(0, int), np.zeros((0, 2)), ""
     if grey is None:
         return Seen(name, cells, nothing, pixels, "cannot be read", "")
@@ -197,7 +196,6 @@ def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, us
 
 
 def _thumbnail(grey: np.ndarray, pixels: np.ndarray) -> str:
-    """A small JPEG in base64 with the corners drawn."""
     cv2 = opencv()
     share = THUMBNAIL_WIDTH_PX / grey.shape[1]
     small = cv2.cvtColor(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)

@@ -30,7 +30,6 @@ def _in_order(values: Sequence[Any], index: Sequence[Tensor]) -> Any:
 
 
 def _column(name: str) -> Any:
-    """What :class:`RowGroups` says of each row, of all parts."""
     return property(lambda data: _in_order([getattr(part, name) for part in data.parts], data.index))
 
 
@@ -105,7 +104,6 @@ class Observations(RowGroups):
         return whole
 
     def rows(self, index: object) -> Observations:
-        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         parts, numbers = [], []
         for part, whole in zip(self.parts, self.index, strict=True):
@@ -118,7 +116,6 @@ class Observations(RowGroups):
         return Observations(parts, numbers)
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Observations:
-        """See :class:`RowGroups`."""
         pairs = zip(self.parts, self.index, strict=True)
         return Observations([change(part, rows) for part, rows in pairs], self.index)
 

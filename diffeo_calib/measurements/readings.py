@@ -376,7 +376,6 @@ class SocketReadings(Readings):
 
     @property
     def stated(self) -> object:
-        """See :class:`Readings`."""
         return super().stated, self.distances, self.distance_std
 
     def measured(self) -> dict[str, Any]:

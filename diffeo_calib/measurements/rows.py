@@ -336,6 +336,12 @@ class RowGroups:
                     test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
 
+    def place_lines(self, held_out: Self) -> Iterator[str]:
+        """A sentence where the sockets of one place alone are left beside rows that are held out."""
+        here, there = (len({*rows.places.tolist()} - {NO_SOCKET}) for rows in (self, held_out))
+        if here == 1 and there:
+            yield f"the sockets of one place alone are fitted, those of {there} more are held out: --holdout 0 fits all"
+
     @property
     def _divided(self) -> tuple[np.ndarray, Tensor, str]:
         """The rows (M,) that splits divide, labels (M,) of those that stay together, and a word for these.

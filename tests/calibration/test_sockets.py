@@ -230,5 +230,8 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     train, test = data.split(0.7, seed=1)
     assert (len(train), len(test)) == (24, 12)
     assert len({name.split("/")[0] for name in test.names}) == 1
+    assert [*train.place_lines(test)] == []
+    one, other = data.rows(data.places < 2).split(0.7)
+    assert "those of 1 more are held out: --holdout 0" in "".join(one.place_lines(other))
     with pytest.raises(MeasurementError, match="expected at least 2 places with sockets, got 1"):
         test.split()

@@ -97,7 +97,7 @@ def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     model = load_laden(options.model, options.payload)
-    read = of_robot(table_format(as_fitted(model, options)), model.robot)
+    read = of_robot(table_format(as_fitted(model, options, options.program)), model.robot)
     table, tips = with_rotation(read, options), options.tip or ()
     if len(tips) == 1:
         model = model.with_tool(model.tool, *tips)
@@ -153,7 +153,6 @@ def _check(options: CorrectOptions) -> None:
 
 
 def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableFormat) -> list[ToolOnTip]:
-    """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):
         expected, fix = f"{max(len(tips), 1)} of them", "give one tool for every --tip"
@@ -194,7 +193,6 @@ def _degrees(solution: Compensation, tool: ToolOnTip) -> Tensor | None:
 
 
 def _summarise(robot: Tree, solution: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
-    """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
     allowed = solution.q.isfinite().all(1)
     if bool(allowed.any()):
         sizes, change = dict[str, Tensor](), solution.correction[allowed].abs()
@@ -236,13 +234,11 @@ def _deviations(covariance: Tensor) -> Tensor:
 
 
 def _sizes(deviations: Tensor) -> tuple[str, str]:
-    """Root mean squares over rows (M, 2) of positions and orientations."""
     shift, turn = deviations.square().mean(0).sqrt().tolist()
     return f"{1e3 * shift:.3f} mm", f"{degrees(turn):.4f} deg"
 
 
 def _missed_lines(solution: Compensation, tools: list[ToolOnTip], lines: list[int]) -> Iterator[str]:
-    """Sentences about the first rows that are not reached."""
     missed = (~solution.reached).nonzero().flatten().tolist()
     for row in missed[:MOST_MISSED]:
         status, misses = str(solution.status[row]), list[str]()

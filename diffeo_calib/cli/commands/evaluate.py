@@ -91,7 +91,6 @@ def run(options: EvaluateOptions) -> None:
 
 
 def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: Measurements | None, name: str) -> None:
-    """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
     named = dict[str, dict[str, Any]]()
     for kind, errors in kinds.items():
         fitted, positions = used[kinds.index[kind]], errors is kinds.positions
@@ -114,7 +113,6 @@ def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: M
 
 
 def _residuals(by_kind: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
-    """Rows of the table of residuals: lengths in the unit of the table, pixels, degrees."""
     for entry in by_kind.lines():
         metres = entry["unit"] == "mm"
         values = [entry[name] * (source.table.per_metre / 1e3 if metres else 1.0) for name in COLUMNS[5:9]]
@@ -123,7 +121,6 @@ def _residuals(by_kind: Evaluations, used: Tensor, source: MeasuredTable) -> Ite
 
 
 def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions) -> None:
-    """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     output = options.output
     warn_outside_range(model, data.q)
     say(*models.another_date_lines(model))
@@ -146,7 +143,6 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
 
 
 def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions) -> None:
-    """Write the page, and say its first line."""
     from diffeo_calib.reports.html.sections import advice, verdict  # noqa: PLC0415  # slow to import, they draw
     from diffeo_calib.reports.report import write_report  # noqa: PLC0415
 
@@ -193,7 +189,7 @@ def run_predict(given: PredictOptions) -> None:
     say(*models.provenance_lines(kinematics))
     units = {name: getattr(given, name) for name in Units.names()}
     typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read = models.as_fitted(kinematics, typed)
+    read = models.as_fitted(kinematics, typed, given.csv)
     layout = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
     rows = Rows(convention=layout.convention, rotation_angle=layout.rotation_angle, payload=layout.payload)
     table = of_robot(with_rows(table_format(read), rows), kinematics.robot)
@@ -251,7 +247,6 @@ class _Readings:
     devices: Sequence[PredictedReadings]
 
     def _unit(self, unit: str) -> tuple[str, float]:
-        """The unit that is written, and how many of it are one of the device's."""
         metres = {"mm": 1e-3, "m": 1.0}.get(unit)
         return (unit, 1.0) if metres is None else (self.table.length, metres * self.table.per_metre)
 

@@ -186,7 +186,6 @@ def _limits(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
 
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, fitted.RigidKinematics]) -> None:
-    """Print how far each export is from the model, and about how far from new measurements."""
     summary = model.summary
     about, new = (None if summary is None else summary.leave_one_out_rms), "new measurements, about"
     if about is None or stands_free(model):  # no position was measured
@@ -205,7 +204,6 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, fitted.RigidKinematics
 
 
 def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
-    """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(controller.origin_numbers(transform), (given.length, given.angle), strict=True)
         each = ((controller.in_unit(values, unit), unit) for values, unit in numbers)
@@ -217,7 +215,6 @@ def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
 
 
 def _table_lines(tables: list[controller.CorrectionTable]) -> Iterator[str]:
-    """Sign and range of the tables."""
     yield "correction tables: a controller adds the correction to the joint value that it is to reach"
     yield "  they hold transmission errors of single joints, neither geometric errors nor gravity sag"
     yield "  only measured joint values are in the tables; nothing is known beyond them"

@@ -91,7 +91,6 @@ class JointExpressions:
 
 
 def _parsed(text: str) -> tuple[dict[str, float], float]:
-    """Factor of each column, and the constant."""
     if "{" not in text or not EXPRESSION.fullmatch(text):
         return {text: 1.0}, 0.0
     factors, constant = dict[str, float](), 0.0

@@ -309,7 +309,6 @@ def pictured(
 
 
 def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
-    """MeasurementError unless two recordings belong to the same time."""
     if times.max() + tolerance < joints.times[0] or times.min() - tolerance > joints.times[-1]:
         expected, fix = (
             f"{joints.times[0]:.3f} to {joints.times[-1]:.3f} s, as of the joints",

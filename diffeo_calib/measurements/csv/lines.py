@@ -339,7 +339,6 @@ def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
 
 
 def _is_units(cells: Sequence[str]) -> bool:
-    """Whether a line holds units alone, of at least one column."""
     return all(map(unit_of, filter(None, cells))) and any(unit_of(cell) not in ("", "-", "none") for cell in cells)
 
 
@@ -355,7 +354,6 @@ def _uncommented(cells: list[str], width: int) -> list[str]:
 
 @lru_cache(maxsize=1 << 14)  # `init` reads a table in many units
 def _value(text: str) -> bool:
-    """Whether a text is a number, with any decimal mark."""
     values = (number(text, decimal) for decimal in ".,")
     return any(value is not None and not isnan(value) for value in values)
 

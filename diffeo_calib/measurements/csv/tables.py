@@ -167,7 +167,9 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
         if check is not None and wrong:
             bad = [(lines[row], column.name, f"{float(values[row]):g}") for row in wrong]
             raise bad_cells(path, bad, check.expected, check.fix)
-    for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
+    read = [*columns.names, *named, *(text for column in words for text in column)]
+    notes = [note for note in file.notes if not (note.startswith("text in") and "".join(read).isascii())] + notes
+    for text in ["; ".join(notes)] * bool(notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
     for body in columns.hideable:
         if bool(numbers[:, columns.places(body.values)].isnan().all()):

@@ -277,5 +277,4 @@ class Predictions:
 
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:
-    """Errors of predicted points (N, P, 3), m."""
     return residuals(lambda _: points, place(lambda _: points, data), data).main

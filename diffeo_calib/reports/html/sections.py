@@ -217,7 +217,6 @@ def trust(findings: Findings) -> Section:
 
 
 def _residuals(findings: Findings) -> Iterator[Picture]:
-    """Errors of every kind against the row, time and temperature, and every joint."""
     robot = findings.model.robot
     for place, kind in enumerate(findings.kinds.values()):
         errors, q = kind.errors, kind.q

@@ -262,7 +262,6 @@ def draw_before_after(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None
 
 
 def _sizes(evaluation: Evaluation) -> np.ndarray:
-    """Known errors in the unit in which they are shown."""
     return np.maximum(evaluation.shown[1] * known(evaluation.errors).numpy(), SMALLEST_ERROR)
 
 
