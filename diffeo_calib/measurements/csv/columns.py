@@ -291,11 +291,7 @@ def _names(path: str) -> dict[str, Any]:
         raise MeasurementError.of(f"'{path}' does not run", got=f"{type(error).__name__}: {error}") from error
 
 
-PER_SI = {
-    **UNITS_PER_METRE,
-    **SPHERICAL_UNITS,
-    None: 1.0,
-}  # units per rad or m; numbers without a unit are as they are
+PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}  # units per rad or m; numbers without a unit are as they are
 POSITIONS, ROTATIONS, STD, ROTATION_STD = "positions", "rotations", "std", "rotation_std"
 """Roles of the columns of a marker or frame."""
 
