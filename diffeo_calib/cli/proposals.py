@@ -308,9 +308,7 @@ def with_measured(source: Source) -> Source:
 
 def with_units(source: Source) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
-
-    Raises:
-        InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
+    InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
     periodic, why, ways = source.robot.periodic, "", source.units
     if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):
@@ -390,9 +388,7 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
 
 def _with_meanings(best: Source) -> Source:
     """With the units and the `joints` with which the robot explains positions; the same if there are none.
-
-    Args:
-        best: in the best units with the columns as they are.
+    best: in the best units with the columns as they are.
     """
     if best.options.socket or best.options.reading:
         return best

@@ -113,9 +113,7 @@ def as_at_the_fit(command: str, given: Given, csv: Path | None = None) -> Given:
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
     unless both --length and --angle are. Marks are then those of the fit too if the file has more columns with them.
-
-    Args:
-        command: that made the model, or the options of its table alone; empty where neither is known. csv: the file.
+    command: that made the model, or the options of its table alone; empty where neither is known. csv: the file.
     """
     wanted, marker = given.left_open(), given.marker if isinstance(given, Rows) else None
     wanted -= {name for name, value in vars(given).items() if value}

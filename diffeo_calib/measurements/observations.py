@@ -40,11 +40,9 @@ NUMBERED = "device_names", "row_names", "places", "socket_numbers"
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Observations(RowGroups):
     """N rows of several kinds, made by :meth:`joined`.
-
-    Args:
-        parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
-            order of their first rows.
-        index: (N_i,) int64 for each part, its row numbers here.
+    parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
+        order of their first rows.
+    index: (N_i,) int64 for each part, its row numbers here.
 
     Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload, covariates,
     device_names, places and socket_numbers hold the values of all rows. A line of a file that holds observations of
@@ -140,9 +138,7 @@ def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
     These are rows with the same columns; rows of several kinds, and all with ``apart``, become :class:`Observations`.
     Beside images of a board positions and rows in sockets become readings of points of the same tool, see
     sensors/tool_frames.py.
-
-    Raises:
-        MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
+    MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
     """
     pieces = _pieces(tables)
     if any("corners" in table.columns for table, _ in pieces):

@@ -98,9 +98,7 @@ def machine_of(bodies: Sequence[guesses.Body]) -> guesses.Body:
 
 def commanded(sheet: guesses.Sheet) -> proposals.Source:
     """The table read as poses of a machine.
-
-    Raises:
-        InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
+    InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
     """
     bodies = poses_in(sheet)
     if not bodies:
@@ -221,9 +219,7 @@ def _alike(
     Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
     shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
     geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
-
-    Args:
-        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
+    commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, target)]
@@ -239,9 +235,7 @@ def _alike(
 
 def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
     """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
-
-    Args:
-        places: (N, 3), m. R: (c, N, 3, 3), of c readings.
+    places: (N, 3), m. R: (c, N, 3, 3), of c readings.
     """
     motions = list[Tensor]()
     for step in STEPS:
@@ -306,9 +300,7 @@ def _commanded(robot: Path | None, sheet: guesses.Sheet) -> proposals.Source | N
 
 def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
     """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
-
-    Raises:
-        InputError: none do, or several.
+    InputError: none do, or several.
     """
     sources, refused = dict[tuple[str | None, ...], proposals.Source](), list[InputError]()
     for arm in (arms := _arms(robot, sheet)):
