@@ -39,7 +39,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, BESIDE, UNITS_PER_METRE, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import check_poses, measured_positions
+from diffeo_calib.sensors.kinds import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0  # a way is clear if every other one leaves more by this factor
 LARGEST_RESIDUAL = 0.1  # median residual, as a share of the spread, above which no way is right

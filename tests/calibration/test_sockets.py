@@ -16,10 +16,8 @@ from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused, warned
 from tangent_bank import covariance
 from torch import Tensor
-from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.identification.identification import (
     KindRows,
@@ -29,9 +27,8 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices
-from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
-from diffeo_calib.calibration.scales.selection import Selection, defaults
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.readings import SocketReadings
@@ -60,19 +57,6 @@ def test_the_sockets_are_where_they_are() -> None:
 @pytest.fixture(scope="module")
 def placed() -> Placed:
     return place(ARM, DATA, silent)
-
-
-def test_places_left_out_by_leaving_them_out(placed: Placed) -> None:
-    """Closed form against a regression without the rows of the place."""
-    tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
-    scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
-    chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    socket, own = devices.device, devices.sockets.place[devices.device] == 2
-    rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
-    mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
-    gram = tangent.linearisation(scales).gram().view(len(DATA), 3, len(DATA), 3)
-    predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]]
-    assert_close(devices.left_out(chosen)[own], predicted - tangent.target[gone], rtol=0, atol=1e-9)
 
 
 def test_deviations_grow_where_places_contradict_each_other(placed: Placed) -> None:

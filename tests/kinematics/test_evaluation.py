@@ -15,8 +15,14 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.judged_rows import judge
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.kinematics.evaluation import place, residuals, rows_used_in_fit
-from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
+from diffeo_calib.kinematics.evaluation import (
+    joints_outside_range,
+    place,
+    refuse_other_angles,
+    residuals,
+    rows_used_in_fit,
+    warn_outside_range,
+)
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 from diffeo_calib.measurements.rows import with_attributes
 

@@ -34,7 +34,7 @@ from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.urdf import corrected_urdf, mjcf_text, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
+from diffeo_calib.kinematics.evaluation import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.columns import Columns

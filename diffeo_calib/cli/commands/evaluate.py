@@ -36,8 +36,8 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics import evaluation
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
+from diffeo_calib.kinematics.evaluation import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.kinematics.hand_eye import IN_TIP, HandEye
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns, PoseColumns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, read_joints, write_predictions

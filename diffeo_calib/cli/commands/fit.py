@@ -22,9 +22,8 @@ from diffeo_calib.cli.main import app
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.evaluation import positions_of
+from diffeo_calib.kinematics.evaluation import positions_of, repeated_lines, warn_outside_range
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
-from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
@@ -32,7 +31,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.kinds import divided
 
 EXIT_UNCONVERGED = 3
 LARGE_SHARE = 0.5  # of the expected error, from which the robot's size is said to be worth measuring
@@ -129,7 +128,7 @@ def _lines_about_places(
     if _of_positions(held_out):  # else they are the verdict
         yield models.stage_line(result.model, result.stages, result.expected)
     yield from models.expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (device.size_advice() for device in result.placement)), None)
+    advice = next(filter(None, (device.size_advice for device in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"

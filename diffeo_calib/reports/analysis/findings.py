@@ -40,7 +40,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions
+from diffeo_calib.sensors.kinds import divided, measured_positions
 
 Kinematics = Callable[[Tensor], Tensor]
 
