@@ -17,10 +17,8 @@ SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", NoneT
 
 def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     """The JSON schema of values of a kind, with their meaning and further keywords.
-
-    Args:
-        kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
-            texts that are allowed, or a schema.
+    kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
+        texts that are allowed, or a schema.
     """
     more |= {"description": text} if text else {}
     if isinstance(kind, dict):
@@ -111,10 +109,7 @@ RESULTS: dict[str, tuple[Any, str]] = {
     "refused": ({str: str}, "Images without a board, and why."),
     "clock_offset_s": (float, "Added to the times of what was seen."),
     "expected_error_m": (MAYBE, "At the end of a campaign."),
-    "session_transforms": (
-        {str: TRANSFORM},
-        "From the measuring frame of the model to each session evaluated.",
-    ),
+    "session_transforms": ({str: TRANSFORM}, "From the measuring frame of the model to each session evaluated."),
     "sessions": ({str: TRANSFORM}, "From the measuring frame of the model to that of each session of a fit."),
     "mountings": ({str: [[float]]}, "Shifts of the markers of each session from those of the model, in their tips, m."),
     "drift": ({str: float}, "m and rad over the range of every column."),

@@ -59,15 +59,19 @@ def test_the_tip_is_before_a_gripper(slide: Tensor, why: str, tmp_path: Path, pr
     assert ("slide" in text.splitlines()[-1]) == bool(slide.numel()), "it is not used"
 
 
-@pytest.mark.parametrize("tip", ["left_jaw", "flange"])
+@pytest.mark.parametrize("tip", ["left_jaw", "flange", "arm_ee"])
 def test_the_tip_is_what_carries_the_marker(tip: str, tmp_path: Path, proposed: Proposed) -> None:
     """On the last axis a marker tells nothing of its joint, but this is one of the arm's."""
     write_arm(tmp_path, *GRIPPER[: 3 * (tip == "left_jaw")])
+    if tip == "arm_ee":  # fixed behind the last link, which has another name
+        write_arm(tmp_path, ("mount", "flange", tip, "fixed", ""))
+        (tmp_path / "arm.urdf").write_text((tmp_path / "arm.urdf").read_text().replace('"flange"', '"link_6"'))
     robot = dc.load_urdf(tmp_path / "arm.urdf", "base_link", tip)
     q, slide = ARM.measure(ROWS, seed=0)[0], OPENING if tip == "left_jaw" else OPENING[:, :0]
     points = 1e3 * robot(torch.cat([q, slide / 1e3], 1))[:, :3, 3] + noise(ROWS, 3, size=1.0)
-    entries, _ = proposed((robot.joint_names, torch.cat([q.rad2deg(), slide], 1)), (XYZ, points))
+    entries, text = proposed((robot.joint_names, torch.cat([q.rad2deg(), slide], 1)), (XYZ, points))
     assert entries["tip"] == tip
+    assert (f"{tip} is the flange, by its name" in text) == (tip != "left_jaw")
 
 
 def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, proposed: Proposed) -> None:

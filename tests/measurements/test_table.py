@@ -1,4 +1,4 @@
-"""The measurements in memory: validation, known noise, hidden markers and frames, subsets, splits and folds."""
+"""The measurements in memory: validation, known noise, hidden markers and frames, subsets, splits."""
 
 import copy
 import math
@@ -257,7 +257,7 @@ def test_parts_carry_poses_and_known_noise(kind: str) -> None:
         data = Measurements(q, points, ["a", "b"], ["m", "n"], std=std)
     whole = everything(data)
     assert len(whole) == (6 if kind == "poses" else 4)
-    for part in (data[3:7], data[[5, 1]], *data.split(0.6), *data.folds(3)[1], next(iter(data)), copy.deepcopy(data)):
+    for part in (data[3:7], data[[5, 1]], *data.split(0.6), next(iter(data)), copy.deepcopy(data)):
         rows = [int((data.q == own).all(1).nonzero()[0, 0]) for own in part.q]
         for name, values in everything(part).items():
             assert_close(values, whole[name][rows], rtol=0, atol=0)
@@ -280,26 +280,17 @@ def repeated_measurements(draw: st.DrawFn) -> Measurements:
     return Measurements(q, points)
 
 
-@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(2, 4), st.integers(0, 5))
-def test_splits_and_folds_cut_no_group(data: Measurements, fraction: float, k: int, seed: int) -> None:
+@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(0, 5))
+def test_splits_cut_no_group(data: Measurements, fraction: float, seed: int) -> None:
     row, group = (data.points[:, 0, axis].int().tolist() for axis in (0, 1))
     largest = int(torch.bincount(data.groups()).max())
     train, test = data.split(fraction, seed)
     assert 0 < len(train) < len(data)
     assert abs(len(train) - round(fraction * len(data))) <= largest
-    folds = [] if len(set(group)) < k else data.folds(k, seed)
-    for one, other in ((train, test), *folds):
-        rows, others = (part.points[:, 0, 0].int().tolist() for part in (one, other))
-        assert sorted(rows + others) == row
-        assert rows == sorted(rows)
-        assert not {group[own] for own in rows} & {group[own] for own in others}
-    if not folds:
-        with pytest.raises(MeasurementError, match=f"{k} folds.*got {len(set(group))}"):
-            data.folds(k, seed)
-        return
-    assert sorted(int(own) for _, test in folds for own in test.points[:, 0, 0]) == row
-    sizes = [len(test) for _, test in folds]
-    assert max(sizes) - min(sizes) <= largest
+    rows, others = (part.points[:, 0, 0].int().tolist() for part in (train, test))
+    assert sorted(rows + others) == row
+    assert rows == sorted(rows)
+    assert not {group[own] for own in rows} & {group[own] for own in others}
 
 
 def test_splits_without_repeats_and_refusals() -> None:
@@ -308,7 +299,6 @@ def test_splits_without_repeats_and_refusals() -> None:
     assert len(first) == len(second) == 70
     assert torch.equal(first.q, again.q)
     assert not torch.equal(first.q, second.q)
-    assert [len(test) for _, test in data.folds(4)] == [25] * 4
     repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
     for data in (repeated, some(1)):
         with pytest.raises(MeasurementError, match=r"cannot split.*2 distinct configurations.*got 1"):
@@ -316,8 +306,6 @@ def test_splits_without_repeats_and_refusals() -> None:
     for fraction in (0.0, 1.0, 70, nan):
         with pytest.raises(MeasurementError, match=r"`fraction`.*between 0 and 1"):
             some(10).split(fraction)
-    with pytest.raises(MeasurementError, match=r"`k`.*at least 2"):
-        some(10).folds(1)
 
 
 @pytest.mark.parametrize("seed", range(5))
