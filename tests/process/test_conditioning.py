@@ -15,6 +15,7 @@ from torch.testing import assert_close
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.scales import NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine, Hyperparameters, Pairs
+from diffeo_calib.regression import cholesky
 from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
 from diffeo_calib.regression.linear_rows import Evidence
@@ -94,8 +95,10 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
 
 
-def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
-    """The evidence of later rows is a difference."""
+@pytest.mark.parametrize("most", [0, 1000])
+def test_rows_may_come_in_parts_and_in_any_order(case: Case, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was expected before goes on with later rows, whose evidence is a difference."""
+    monkeypatch.setattr(cholesky, "MOST_ADDED", most)
     first, second, new = cut(case)
     prior, rows = case.data.prior(case.scales), torch.arange(len(case.data.x))
     both, all_of = case.part(rows[rows % 3 != 2]), case.part(rows)
@@ -114,9 +117,13 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
         for actual, wanted in zip(noiseless(found, new), expected, strict=True):
             close(actual, wanted, 1e-9)
         assert_close(found.inverse @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
-        again = found.given(new.numbers, new.noise)  # a factor of three parts
+        again = found.given(new.numbers, new.noise)  # a factor of three parts, or of two
         close(noiseless(again, new)[0], noiseless(prior.given(all_of.numbers, all_of.noise), new)[0], 1e-9)
-        plain = found.features(new.numbers.at)
+        plain, known = found.features(new.numbers.at), before.features(new.numbers.at)
+        later = found.features(new.numbers.at, known)
+        close(found.mean(later), found.mean(plain), 1e-9)
+        close(later.between(), plain.between(), 1e-9)
+        close(later.between(plain), plain.between(), 1e-9)
         close(found.covariance(new.numbers.at), diagonal_blocks(plain.between(), len(new.data.x)), 1e-9)
         K, target = b.numbers.with_noise(at.between(), b.noise), b.numbers.there(before.mean(at))
         normal = torch.distributions.MultivariateNormal(target, (K + K.T) / 2)
@@ -177,7 +184,7 @@ def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | N
     E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)
     found = case.posterior.opened(E, size)
     W = found.factor.W
-    again = Factor(found.factor.L, W)
+    again = Factor(found.factor.L, W, W.T @ W)
     more = 2.0 * E if size else E / E.norm(dim=0)
     close(again.matrix, case.posterior.factor.matrix + more @ more.T, 1e-9)
     close(found.inverse, again.inverse, 1e-7)
