@@ -39,7 +39,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, BESIDE, UNITS_PER_METRE, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import check_poses, measured_positions
+from diffeo_calib.sensors.kinds import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0  # a way is clear if every other one leaves more by this factor
 LARGEST_RESIDUAL = 0.1  # median residual, as a share of the spread, above which no way is right
@@ -308,9 +308,7 @@ def with_measured(source: Source) -> Source:
 
 def with_units(source: Source) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
-
-    Raises:
-        InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
+    InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
     periodic, why, ways = source.robot.periodic, "", source.units
     if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):
@@ -390,9 +388,7 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
 
 def _with_meanings(best: Source) -> Source:
     """With the units and the `joints` with which the robot explains positions; the same if there are none.
-
-    Args:
-        best: in the best units with the columns as they are.
+    best: in the best units with the columns as they are.
     """
     if best.options.socket or best.options.reading:
         return best
@@ -434,9 +430,8 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual = " or ".join(dict.fromkeys(body.usual for body in turned))
         names = [name for body in turned for name in body.turn]
-        remark = f"{few(names, 9)}: {what}; not used; such names usually mean {usual}"
+        remark = f"{few(names, 9)}: {what}; not used"
         return source if camera else source.remarking(remark)
     why = {"convention": reason(*ways)}
     if camera:

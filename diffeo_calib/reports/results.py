@@ -17,10 +17,8 @@ SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", NoneT
 
 def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     """The JSON schema of values of a kind, with their meaning and further keywords.
-
-    Args:
-        kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
-            texts that are allowed, or a schema.
+    kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
+        texts that are allowed, or a schema.
     """
     more |= {"description": text} if text else {}
     if isinstance(kind, dict):
@@ -111,10 +109,7 @@ RESULTS: dict[str, tuple[Any, str]] = {
     "refused": ({str: str}, "Images without a board, and why."),
     "clock_offset_s": (float, "Added to the times of what was seen."),
     "expected_error_m": (MAYBE, "At the end of a campaign."),
-    "session_transforms": (
-        {str: TRANSFORM},
-        "From the measuring frame of the model to each session evaluated.",
-    ),
+    "session_transforms": ({str: TRANSFORM}, "From the measuring frame of the model to each session evaluated."),
     "sessions": ({str: TRANSFORM}, "From the measuring frame of the model to that of each session of a fit."),
     "mountings": ({str: [[float]]}, "Shifts of the markers of each session from those of the model, in their tips, m."),
     "drift": ({str: float}, "m and rad over the range of every column."),
@@ -152,9 +147,8 @@ RESULTS: dict[str, tuple[Any, str]] = {
         "depth.",
     ),
     "sockets": (
-        entries({"positions_m": {str: [float]}, "left_out_spread_m": float}),
-        "Sockets after a fit, in the measuring frame (the robot's base if no position was measured), and every place "
-        "as predicted by the others (a spread, no error).",
+        entries({"positions_m": {str: [float]}}),
+        "Sockets after a fit, in the measuring frame (the robot's base if no position was measured).",
     ),
     "camera": (CAMERA, ""),
     "cameras": ({str: CAMERA}, "The same of each of several cameras, by its name."),

@@ -26,8 +26,8 @@ FILES: list[Case] = [
     (TABLE + "1,2,3\n", {}, "line 4: expected 5 cells ... got 3"),
     ('"q1",q2,x,y,z\n"1\n",2,3,4,5\n1,2\n' + "1\n" * 6, {}, "line 4, 5, 6, 7, 8 and 2 more: ... got 2"),
     ("q1,q2,x,y,z,q2\n", {}, "header: ['q2'] named more than once"),
-    (HEADER, {"joints": ["Q1", "q22"]}, "no column ['Q1', 'q22'] ... ['q1', 'q2' ... mean q1 ... mean q2"),
-    ("q1,joint_Q2,x,y,z\n1,2,3,4,5\n", {}, "for 'q2', did you mean joint_Q2."),
+    (HEADER, {"joints": ["Q1", "q22"]}, "no column ['Q1', 'q22'] ... ['q1', 'q2'"),
+    ("q1,joint_Q2,x,y,z\n1,2,3,4,5\n", {}, "no column ['q2'] ... joint_Q2"),
     (HEADER, {"position": ["x", "y", "height"]}, "no column ['height'] ... written in the header"),
     (GERMAN + "1;2;3;4;5\n", {}, "single column 'q1;q2;x;y;z' without ',' ... pass sep=';'"),
     (DECIMALS, {"sep": ";"}, "line 3, column 'q1' (and 2 more, on line 4) ... '1,5' ... decimal comma ... decimal=','"),
@@ -42,9 +42,7 @@ FILES: list[Case] = [
     (HEADER + '1,2,"3,4,5\n6,7,8,9,10\n', {}, "line 2: not valid CSV ... quotes"),
     (b"\0\1" + TABLE.encode(), {}, "is no text but binary"),
     (TABLE.replace("x,", "x (cm),"), {"position": ["x (cm)", "y", "z"], "length": "mm"}, STATED.format("cm")),
-    (HEADER + "rad,rad,m,mm,mm\n" + ROWS, {"length": "mm"}, "column 'x': " + STATED.format("m")),
     (HEADER + "degree,弧度,米,mm,毫米\n" + ROWS, {"length": "mm"}, "column 'q1': expected rad, as stated, got deg"),
-    (TABLE.replace("0.1,", "12°30',"), {}, "column 'q1': expected rad, as stated, got deg"),
     (TABLE.replace("0.1,", "12°75',"), {"angle": "deg"}, "column 'q1': expected a number, got \"12°75'"),
     ('q1,q2,p\n0,0,"[1, 2, 3]"\n1,1,"[1, 2, 4]"\n1,2,7\n', PARTS, "line 4, column 'p_x' ... got '7_1'"),
     ("q1;q2;p\n0;0;[0,1 0,2 0,3]\n1;1;[0,1 0,2 0,4]\n", PARTS | {"sep": ";", "decimal": ","}, "no column ['p_x'"),
@@ -57,8 +55,6 @@ OPTIONS: list[Case] = [
     (TABLE, {"sep": "::"}, "`sep`: expected one character, got '::'"),
     (TABLE, {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
     (TABLE, {"joints": "q1"}, "`joints` ... 'q1'"),
-    (TABLE, {"joints": ["q1", "x"]}, "distinct columns, got ['x'] twice"),
-    (TABLE, {"position": [["x", "y", "z"]] * 2}, "distinct columns, got ['x'"),
     (TABLE, {"position": "xyz"}, "`position`: expected three names"),
     (TABLE, {"position": [["x", "y", "z"], ["x", "y"]]}, "`position`"),
     (TABLE, {"kinds": ["revolute"]}, "`joints`: expected 1 columns, one for each of `kinds` ... got 2 (['q1'"),
@@ -88,30 +84,18 @@ POSES: list[Case] = [
     (POSE, QUATERNION | {"rotation_angle": "deg"}, "`rotation_angle` beside convention 'quat_xyzw' ... leave it out"),
     (POSE, QUATERNION, "line 2, columns a, b, c, d: expected a quaternion of length 1 ... got 37.4299 ... order"),
     (POSE, QUATERNION | {"rotation_std": ["u", "v", "w"]}, "`rotation_angle` is missing"),
-    (POSE, {"rotation": ["a", "b", "x"]}, "distinct columns, got ['x'] twice"),
     (POSE, {"position": TWO, "rotation": ["q1"] * 3}, "`rotation`: expected a list for each position"),
     (POSE, {"rotation": [["a", "b", "c"], ["a", "b"]]}, "`rotation`: expected 3 names ... got ['a', 'b']"),
     (POSE, {"std": ["d", "q1"]}, "`std`: expected ... one per marker ... got ['d', 'q1']"),
-    (POSE, {"std": ["a"]}, "distinct columns, got ['a'] twice"),
-    (
-        POSE,
-        NO_ROTATION | {"spherical": "zenith_gon", "std": ["a", "b", "c"]},
-        "`std` of a distance and two angles: got",
-    ),
+    (POSE, NO_ROTATION | {"spherical": "zenith_gon", "std": list("abc")}, "`std` of a distance and two angles: got"),
     (POSE, {"rotation_std": ["d", "e"]}, "`rotation_std` ... three, or one for all three axes, got ['d', 'e']"),
-    (POSE, {"rotation_std": ["d", "d", "d"]}, "distinct columns, got ['d'] twice"),
-    (POSE, {"rotation_std": [["d"], ["e", "f", "g"]]}, "`rotation_std`: expected as many names ... got 1 and 3"),
     (POSE + "0,0,1,2,3,10,,30,1\n", {}, "line 3, column 'b' ... an empty cell"),
     (POSE + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, "line 4, column 'd' ... got '0'"),
     (MATRICES + ",1,0,0,0,1,0,0,0,-1\n", MATRIX, "line 3, columns r0, r1 ... mirrored"),
     (MATRICES + ",2,0,0,0,2,0,0,0,2\n", MATRIX, "line 3 ... orthonormal ... without a scale"),
     (POSE.replace("a,b,c", ",".join(RAD)), {"rotation": RAD}, "column 'a [rad]': expected deg, as stated, got rad"),
 ]
-FRAMES: dict[str, Any] = {
-    "rotation": [["a", "b", "c"], ["A", "B", "C"]],
-    "convention": "rotvec",
-    "rotation_angle": "rad",
-}
+FRAMES: dict[str, Any] = {"rotation": [[*"abc"], [*"ABC"]], "convention": "rotvec", "rotation_angle": "rad"}
 FRAMES |= {"joints": ["q"], "position": [["x", "y", "z"], ["X", "Y", "Z"]]}
 TWO_FRAMES = "q,x,y,z,a,b,c,X,Y,Z,A,B,C\n0.1,1,2,3,0.1,0.2,0.3,1,2,3,0.1,0.2,0.3\n"
 ONE_FRAME = TWO_FRAMES.partition("\n")[0] + "\n1,,,,,,,1,2,3,0,0,0\n"
@@ -134,15 +118,11 @@ HALVES = {
     "0.7,,,,,,,": "'q2': expected a finite number",
     "0.7,0.8,1,2,3,,inf,": "'by' ... 'inf'",  # and not the empty one beside it
     "0.7,0.8,1,2,3,,,1e400": "'bz' ... '1e400'",
-    "0.7,0.8,1,2,3,,nan,5": "'by' ... 'nan'",
-    "0.7,far,1,2,3,4,5,6": "'q2' ... 'far'",
     "0.7,1e13,1,2,3,4,5,6": "'q2' ... '1e13'",
-    "0.7,MISSING,1,2,3,4,5,6": "'q2' ... 'MISSING'",
 }
 HIDDEN: list[Case] = [
     *((MARKERS + row + "\n", PAIR, f"line 5, column {message}") for row, message in HALVES.items()),
     (DEVIATIONS, COMMAS | PAIR | {"std": ["sa", "sb"]}, "line 2, column 'sa' ... an empty cell"),
-    (DEVIATIONS, COMMAS | PAIR | {"std": ["sa"]}, "line 2, column 'sa' ... an empty cell"),  # one for all
     (MARKERS.partition("0.5,0.6")[0].replace("4,5,6", ",,"), PAIR, "bx, by, bz: empty in all lines"),
 ]
 BALLS = "q1,q2,ball,x,y,z\n0.1,0.2,top,1,2,3\n0.3,0.4,low,1,1,2\n"
@@ -152,7 +132,6 @@ OF_MARKERS: list[Case] = [
     (BALLS, {"marker": "smr"}, "no column ['smr']"),
     (BALLS.replace("top", ""), BALL, "line 2, column 'ball': expected the name of a marker, got an empty cell"),
     (BALLS, BALL | {"position": [["x", "y", "z"], ["u", "v", "w"]]}, "`marker` (ball): expected one position"),
-    (BALLS, BALL | POSED, "`marker` (ball)"),
     (BALLS, BALL | {"socket": "place"}, "`marker` (ball)"),
 ]
 
@@ -209,9 +188,7 @@ NOTHING = {"position": None, "sockets": None}
         (("1,2,3,", "1,,3,"), {}, "line 2, column 'y'"),
         (("1.5,,,,A", "far,,,,A"), {}, "line 3, column 'd': expected a number, got 'far'"),
         (("1.5,,,,A", "1.5,,,,"), {}, "line 3, column 'who': expected the name of the device of this reading"),
-        (("1.5,,,,A", "-1.5,,,,A"), {}, "line 3, column 'd': expected a distance above 0, got '-1.5'"),
         (("A,0.1", "A,"), {}, "line 3, column 'sd': expected a finite number, got an empty cell"),
-        (("A,0.1", "A,-1"), {}, "line 3, column 'sd': expected a positive standard deviation, got '-1'"),
         (("7,8,,C", ",,s0,"), {}, "columns u, v: empty in all lines: expected some line that holds an image"),
         (("0.5,0.6,", "0.2,0.3,,,,1.5,,,,A,0.1\n0.7,0.6,"), {}, "line 6 repeats 3"),
         ((), {"sockets": None, "position": None, "readings": ()}, "`position` is missing"),

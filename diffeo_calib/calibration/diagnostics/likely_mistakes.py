@@ -421,9 +421,6 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     A table that is out of step from its first line to its last is left to :func:`likely_mistake`. Where the whole table
     fits nowhere, consecutive rows that are consistent by themselves say where the joints of the others are.
 
-    Args:
-        robot: n joints. data: N rows. registration: of the whole table.
-
     Raises:
         MeasurementError: with the line, and where the right joints are.
     """

@@ -34,13 +34,13 @@ from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.csv.files import read_poses
-from diffeo_calib.measurements.poses import rotation_matrices
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
+from diffeo_calib.measurements.poses import readings_of
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, ZERO
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
-from diffeo_calib.sensors.tables import measured_positions
+from diffeo_calib.sensors.kinds import measured_positions
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
@@ -98,9 +98,7 @@ def machine_of(bodies: Sequence[guesses.Body]) -> guesses.Body:
 
 def commanded(sheet: guesses.Sheet) -> proposals.Source:
     """The table read as poses of a machine.
-
-    Raises:
-        InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
+    InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
     """
     bodies = poses_in(sheet)
     if not bodies:
@@ -172,7 +170,8 @@ def _ways(
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
     length = lengths[0] or _lengths(machine.place, commanded_at)[0]
     other = lengths[1] or (_lengths(place, seen_at)[0] if place else length)
-    own, seen = _readings(commanded_turn), _readings(seen_turn)
+    each = (commanded_turn, seen_turn)
+    own, seen = ({Reading(name, unit): turns for name, unit, turns in readings_of(numbers)} for numbers in each)
     if own and seen:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
@@ -212,17 +211,6 @@ def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     return ("mm",) if largest > LARGEST_IN_METRES else ("m",) if largest < SURELY_METRES else ("m", "mm")
 
 
-def _readings(numbers: Tensor) -> dict[Reading, Tensor]:
-    """Rotations (N, 3, 3) in every convention that can be meant."""
-    rotations = dict[Reading, Tensor]()
-    count = numbers.shape[1]
-    for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == count):
-        for angle in ("deg", "rad") if count == 3 else ("rad",):
-            with suppress(InputError):
-                rotations[Reading(convention, angle)] = rotation_matrices(numbers, convention, angle=angle)
-    return rotations
-
-
 def _alike(
     commanded: tuple[Tensor, dict[Reading, Tensor]], target: tuple[Tensor, dict[Reading, Tensor]]
 ) -> list[tuple[Reading, Reading, bool]]:
@@ -231,9 +219,7 @@ def _alike(
     Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
     shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
     geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
-
-    Args:
-        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
+    commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, target)]
@@ -249,9 +235,7 @@ def _alike(
 
 def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
     """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
-
-    Args:
-        places: (N, 3), m. R: (c, N, 3, 3), of c readings.
+    places: (N, 3), m. R: (c, N, 3, 3), of c readings.
     """
     motions = list[Tensor]()
     for step in STEPS:
@@ -265,7 +249,7 @@ def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
 
 
 NOT_RAISED = 1.01  # ratio of residuals without and with a joint up to which the markers do not follow it
-FLANGES = ("flange", "tool0")  # ends of the names of links to which tools are screwed
+FLANGES = ("flange", "tool0", "ee", "eef")  # what names of links say to which tools are screwed, the surest first
 
 
 def run(given: InitOptions) -> None:
@@ -316,9 +300,7 @@ def _commanded(robot: Path | None, sheet: guesses.Sheet) -> proposals.Source | N
 
 def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
     """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
-
-    Raises:
-        InputError: none do, or several.
+    InputError: none do, or several.
     """
     sources, refused = dict[tuple[str | None, ...], proposals.Source](), list[InputError]()
     for arm in (arms := _arms(robot, sheet)):
@@ -379,7 +361,6 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
 
 
 def _with_tip(robot: Path, source: proposals.Source, arm: Arm) -> proposals.Source:
-    """Drop joints at the end that no marker follows, and say why the tip is there."""
     left_out = list[str]()
     moved = (source.data.q.amax(0) - source.data.q.amin(0)).tolist()
     while len(arm.joints) > 1 and "joints" not in source.asked:
@@ -398,7 +379,9 @@ def _with_tip(robot: Path, source: proposals.Source, arm: Arm) -> proposals.Sour
             left_out.append(f"{words}, without it {proposals.percent(without.left)}")
         arm, source = shorter, without
     source = proposals.with_units(source) if left_out else source
-    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+    tip = (arm.links.tip or [""])[0]
+    flange = f": {tip} is the flange, by its name" * any(_says(tip, word) for word in FLANGES)
+    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers{flange}", *left_out])
     return source.into({"tip": why}, tip=arm.links.tip)
 
 
@@ -463,4 +446,9 @@ def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[
     fixed = {element.child: element.parent for path in paths for element in path if element.kind == "fixed"}
     for link in links:
         links += [child for child, parent in fixed.items() if parent == link]
-    return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])
+    named = ([link for link in links if _says(link, word)] for word in FLANGES)
+    return next((flanges[0] for flanges in named if len(flanges) == 1), links[0])
+
+
+def _says(link: str, word: str) -> bool:
+    return word in column(link).words or (len(word) > len("eef") and link.lower().endswith(word))

@@ -26,19 +26,11 @@ VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple"
 
 class Picture:
     """One panel, drawn by ``draw(axes, *what, **how)``.
-
-    Args:
-        name: distinguishes its elements from those of other panels. label: what it shows, in words.
+    name: distinguishes its elements from those of other panels. label: what it shows, in words.
     """
 
     def __init__(
-        self,
-        name: str,
-        label: str,
-        draw: Callable[..., None],
-        *what: Any,
-        frame: style.Frame = style.FRAME,
-        **how: Any,
+        self, name: str, label: str, draw: Callable[..., None], *what: Any, frame: style.Frame = style.FRAME, **how: Any
     ) -> None:
         self.name, self.label, self._draw, self._frame = name, label, partial(draw, **how), frame
         self._what = what
