@@ -85,11 +85,7 @@ def machine_of(bodies: Sequence[Body]) -> Body:
 
 
 def commanded(sheet: Sheet) -> Source:
-    """The table read as poses of a machine.
-
-    Raises:
-        InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
-    """
+    """The table as poses of a machine; InputError without poses, places that were measured, or a clear way to read."""
     bodies = poses_in(sheet)
     if not bodies:
         expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
@@ -216,10 +212,8 @@ def _alike(
 
     Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
     shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
-    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
-
-    Args:
-        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
+    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell. Of each body places (N, 3), m,
+    and rotations (N, 3, 3) by reading.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, target)]
@@ -234,11 +228,7 @@ def _alike(
 
 
 def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
-    """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
-
-    Args:
-        places: (N, 3), m. R: (c, N, 3, 3), of c readings.
-    """
+    """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c readings, 2 K)."""
     motions = list[Tensor]()
     for step in STEPS:
         turns = R.mT @ R.roll(-step, 1)

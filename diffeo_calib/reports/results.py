@@ -111,10 +111,7 @@ RESULTS: dict[str, tuple[Any, str]] = {
     "refused": ({str: str}, "Images without a board, and why."),
     "clock_offset_s": (float, "Added to the times of what was seen."),
     "expected_error_m": (MAYBE, "At the end of a campaign."),
-    "session_transforms": (
-        {str: TRANSFORM},
-        "From the measuring frame of the model to each session evaluated.",
-    ),
+    "session_transforms": ({str: TRANSFORM}, "From the measuring frame of the model to each session evaluated."),
     "sessions": ({str: TRANSFORM}, "From the measuring frame of the model to that of each session of a fit."),
     "mountings": ({str: [[float]]}, "Shifts of the markers of each session from those of the model, in their tips, m."),
     "drift": ({str: float}, "m and rad over the range of every column."),

@@ -253,11 +253,7 @@ class Evaluations(Mapping[str, Evaluation]):
     """
 
     def __init__(
-        self,
-        kinds: Mapping[str, Evaluation],
-        index: Mapping[str, Tensor],
-        placed: Sequence[str] = (),
-        numbers: int = 0,
+        self, kinds: Mapping[str, Evaluation], index: Mapping[str, Tensor], placed: Sequence[str] = (), numbers: int = 0
     ) -> None:
         self._kinds, self.index = dict(kinds), dict(index)
         self.placed, self.numbers = tuple(placed), numbers

@@ -12,13 +12,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.measurements.bodies import triple
-from diffeo_calib.sensors.devices import (
-    SMALLEST_DISTANCE_M,
-    Devices,
-    Hypothesis,
-    least_squares,
-    refuse_first,
-)
+from diffeo_calib.sensors.devices import SMALLEST_DISTANCE_M, Devices, Hypothesis, least_squares, refuse_first
 
 FIXED_DEVIATION_M = 1e-9  # prior standard deviation of an offset that is known to be zero
 UNKNOWN_ZERO_M = 1.0

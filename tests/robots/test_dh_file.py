@@ -41,7 +41,7 @@ FILES = {
     "blanks, greek": lines("  ", "type θ d a α", METRES),
     "makers' units": lines(
         ";",
-        "Joint;Type;alpha [deg];a [mm];d [mm];theta [deg]",
+        "Gelenk;Type;alpha [Grad];a [mm];d [mm];theta [deg]",
         [
             [f"A{k}", r.kind[0].upper(), *in_degrees(r.alpha), 1e3 * r.a, 1e3 * r.d, *in_degrees(r.theta)]
             for k, r in enumerate(ROWS)

@@ -21,13 +21,7 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, write_c
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text, ur_text, ur_transforms
-from diffeo_calib.interop.rigid import (
-    Compared,
-    RigidKinematics,
-    best_joint_offsets,
-    rigid_kinematics,
-    with_errors,
-)
+from diffeo_calib.interop.rigid import Compared, RigidKinematics, best_joint_offsets, rigid_kinematics, with_errors
 from diffeo_calib.interop.tables import (
     CorrectionTable,
     correction_tables,

@@ -40,6 +40,7 @@ from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
 
 NOT_RAISED = 1.01  # ratio of residuals without and with a joint up to which the markers do not follow it
+SIDES = {"l": "left", "r": "right"}
 FLANGES = ("flange", "tool0")  # ends of the names of links to which tools are screwed
 
 
@@ -90,11 +91,7 @@ def _commanded(robot: Path | None, sheet: Sheet) -> Source | None:
 
 
 def _of_robot(robot: Path, sheet: Sheet) -> Source:
-    """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
-
-    Raises:
-        InputError: none do, or several.
-    """
+    """The table as values of the joints, or in the convention, that explain the rows; InputError unless one does."""
     sources, refused = dict[tuple[str | None, ...], Source](), list[InputError]()
     for arm in (arms := _arms(robot, sheet)):
         try:
@@ -140,13 +137,14 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
 
     Fingers of a gripper are no arms: each has a joint or none of its own.
     """
-    words = {path[-1].child: {*column(path[-1].child).words} for path in paths}
+    words = {path[-1].child: {SIDES.get(word, word) for word in column(path[-1].child).words} for path in paths}
     counts = Counter(word for group in words.values() for word in group)
     uses = Counter(joint.name for path in paths for joint in path if joint.kind != "fixed")
     arms = [path[-1].child for path in paths if sum(uses[joint.name] == 1 for joint in path) > 1]
     tips = list[str]()
     for marker in markers:
-        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & {*marker.words})]
+        said = {SIDES.get(word, word) for word in marker.words}
+        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & said)]
         tips += ([leaf for leaf in words if column(leaf).plain == marker.plain.removesuffix("x")] or alike)[:1]
     return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
@@ -171,6 +169,7 @@ def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
             left_out.append(f"{words}, without it {percent(without.left)}")
         arm, source = shorter, without
     source = with_units(source) if left_out else source
+    left_out += [f"no column is named after {few(arm.lacking)}"] * bool(arm.lacking)
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
     return source.into({"tip": why}, tip=arm.links.tip)
 
@@ -209,8 +208,8 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
             guessed = sheet.joint_columns(joints[:count])
             series = bool(guessed) and guessed[0].how.startswith("numbered")
             if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
-                lacking = joints_without_column(sheet.numbers, joints) if count < len(joints) else ()
-                arm = Arm(options, joints[:count], ends, guessed[0], tuple(lacking))
+                lacking = joints[count:] if series else joints_without_column(sheet.numbers, joints)
+                arm = Arm(options, joints[:count], ends, guessed[0], tuple(lacking if count < len(joints) else ()))
                 arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
                 break
     if not arms:

@@ -17,14 +17,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import (
-    check_rows,
-    place,
-    placement_sentences,
-    positions_of,
-    residuals,
-    unseen,
-)
+from diffeo_calib.kinematics.evaluation import check_rows, place, placement_sentences, positions_of, residuals, unseen
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast

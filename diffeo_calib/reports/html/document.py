@@ -32,13 +32,7 @@ class Picture:
     """
 
     def __init__(
-        self,
-        name: str,
-        label: str,
-        draw: Callable[..., None],
-        *what: Any,
-        frame: style.Frame = style.FRAME,
-        **how: Any,
+        self, name: str, label: str, draw: Callable[..., None], *what: Any, frame: style.Frame = style.FRAME, **how: Any
     ) -> None:
         self.name, self.label, self._draw, self._frame = name, label, partial(draw, **how), frame
         self._what = what
