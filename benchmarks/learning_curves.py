@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from harness import Record
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.plots.style import LOOKS
+from diffeo_calib.reports.plots.panels import LOOKS
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics as CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation as Compensation
     from diffeo_calib.kinematics.compensation.compensate import compensate as compensate
+    from diffeo_calib.kinematics.evaluation import joints_outside_range as joints_outside_range
     from diffeo_calib.kinematics.evaluation import rows_used_in_fit as rows_used_in_fit
-    from diffeo_calib.kinematics.joint_ranges import joints_outside_range as joints_outside_range
     from diffeo_calib.measurements.csv.files import read_measurements as read_measurements
     from diffeo_calib.measurements.csv.sensors import ReadingColumns as ReadingColumns
     from diffeo_calib.measurements.observations import Observations as Observations

@@ -11,7 +11,7 @@
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 # One file or more for every library.
-QUICK="tests/test_package.py tests/common/test_threads.py tests/flows/test_integrators.py tests/kernels/test_fused_sums.py \
+QUICK="tests/test_package.py tests/common/test_threads.py tests/flows/test_geodesic.py tests/kernels/test_fused_sums.py \
 tests/robots/test_chains.py tests/cameras tests/measurements/test_bags.py tests/measurements/test_table.py \
 tests/interop/test_model_file.py tests/interop/test_sklearn.py tests/interop/test_torch_program.py \
 tests/interop/test_mjcf.py tests/cli/test_help.py tests/cli/test_refused_commands.py"

@@ -27,6 +27,7 @@ from product_bank import (
     sliding_measurements,
     sliding_robot,
     ur10_measurements,
+    ur10_scales,
     usual_scales,
     with_usual_scales,
 )
@@ -98,18 +99,18 @@ def browser() -> Iterator[Any]:
 
 BY_KIND = (
     *("test_matrix.py", "test_kinds_judged.py", "test_init.py", "test_live_campaign.py", "test_expected_errors.py"),
-    *("test_registered_kinds.py", "test_predicted_readings.py", "test_laws_of_kinds.py", "test_golden.py"),
+    *("test_registered_kinds.py", "test_laws_of_kinds.py", "test_golden.py"),
 )
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
     *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_tool.py", "test_rigid.py"),
-    *("test_planned_sensors.py", "test_json_results.py"),
+    *("test_plan.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
-    *("test_refused.py", "test_second_device.py", "test_fit.py"),
-    *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_mixtures.py", "test_sessions.py"),
+    *("test_second_device.py", "test_fit.py"),
+    *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_set_ups.py"),
 )
 """File names, those of a quarter of a minute and more; all others follow in the usual order."""
 
@@ -173,4 +174,4 @@ def ur10_150(ur10_folder: Path) -> Case:
     train, test = data.split(0.7, seed=0)
     some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
     some = dc.Measurements(some.q, some.points)
-    return shared("ur10 150", lambda: Case(robot, some, test, dc.calibrate(robot, some)))
+    return shared("ur10 150", lambda: Case(robot, some, test, dc.calibrate(robot, some, hyperparameters=ur10_scales())))

@@ -210,7 +210,7 @@ def test_floors_are_enforced() -> None:
 # sensor or of its set of devices.
 
 ROOMS = ("calibration", "kinematics", "reports", "cli/commands")
-OF_DEVICES = ("calibration/placing/readings.py", "calibration/placing/sessions.py")
+OF_DEVICES = ("calibration/placing/readings.py", "calibration/placing/placement.py")
 TABLES = {"Measurements", "Readings", "Observations"}
 KINDS = {"position", "pose", "socket", "mixture", "distance", "displacement", "height", "image"}
 NAMES = {"sockets", "socket", "session", "sessions", "readings", "lever", "payload", "board"}

@@ -10,7 +10,7 @@ from harness import Record
 from learning_curves import check_place
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.plots.style import LOOKS
+from diffeo_calib.reports.plots.panels import LOOKS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

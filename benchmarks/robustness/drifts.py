@@ -33,7 +33,7 @@ from torch import Tensor
 from varied_arms import KINDS
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.placing.sessions import Drift
+from diffeo_calib.calibration.placing.placement import Drift
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots import SimulatedArm
 

@@ -37,7 +37,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.regression.conditional import diagonal_blocks, roots
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.tables import device_coordinates
+from diffeo_calib.sensors.kinds import device_coordinates
 
 
 def stands_free(model: CalibratedKinematics) -> bool:
@@ -124,9 +124,7 @@ class ExpectedError:
 
 
 def expected_errors(
-    model: CalibratedKinematics,
-    stages: Mapping[str, Callable[[Tensor], Tensor]],
-    expected: ExpectedError | None = None,
+    model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]], expected: ExpectedError | None = None
 ) -> dict[str, float]:
     """Root mean square distances, m, of the positions of every stage from the true ones, by stage.
 

@@ -15,12 +15,10 @@ from diffeo_calib.calibration.diagnostics.judged_rows import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import Placed
-from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.placement import Placement, Sessions
 from diffeo_calib.calibration.placing.readings import ReadingDevices, SocketDevices
-from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
-from diffeo_calib.common.data_frames import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -30,7 +28,7 @@ from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.sensors.coordinates import Places, joined
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.tables import with_positions
+from diffeo_calib.sensors.kinds import with_positions
 
 STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 """The stages of a calibration: base and markers only, with an error of every joint, and the model."""
@@ -88,13 +86,6 @@ class CalibrationResult:
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
-
-    def _repr_html_(self) -> str:
-        """The model and what it explains, for notebooks."""
-        rows = [[part.name, f"{1e3 * part.displacement:.4f}"] for part in self.parts]
-        words = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
-        parts = table_html(f"{self.status}; {words}", ("part", "displacement [mm]"), rows)
-        return self.model._repr_html_() + parts
 
     @property
     def registration(self) -> Identification:

@@ -39,8 +39,8 @@ from diffeo_calib.regression.conditional import Features, Process, diagonal_bloc
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, Hypothesis
+from diffeo_calib.sensors.kinds import rows_of_one_kind
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import rows_of_one_kind
 
 MOST_COORDINATES = 4500  # measured numbers of a posterior: of more rows a random sample stands for all
 EXCEEDANCE_PROBABILITY = 0.05  # probability that the true error is above its limit
@@ -242,10 +242,6 @@ class CampaignModel:
         self.window = [verdict.row for verdict in judged[-gates.WINDOW :] if verdict.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
         self.numbers, self.noise = around.told(around.rows(table.rows(self.window))[0])
-        ats = self.numbers.at, around.errors[0], around.options[0]
-        self._at, self._target, self._options = map(self.process.features, ats)
-        self._cross = self._at.by_fields_with(self._target)
-        _ = self._target.by_fields  # what later ones are lowered from
         self._learn(verdicts)
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
@@ -286,9 +282,8 @@ class CampaignModel:
 
     def next(self, count: int) -> tuple[list[int], list[float]]:
         """Candidates that lower the variance over the target most, and the expected error before and after each, m."""
-        (at, noise), (_, compared), open_ = self.around.options, self.around.errors, self.around.open
-        self._options = self.process.features(at, self._options)
-        options, target = (self.now.features(part.at, part) for part in (self._options, self._target))
+        (at, noise), (aim, compared), open_ = self.around.options, self.around.errors, self.around.open
+        options, target = self.now.features(at), self.now.features(aim)
         how: Any = {
             "place": torch.arange(len(noise), device=HOST),
             "open_": open_,
@@ -316,12 +311,13 @@ class CampaignModel:
         window = [*self.window, *range(first, len(table))]
         data, changes = self.around.rows(table.rows(window))
         numbers, noise = self.around.told(data)
-        new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
-        near, far = (part.by_fields_with(new) for part in (self._at, self._target))
-        at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
+        at, target = self.process.features(numbers.at), self.process.features(self.around.errors[0])
         accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
         root, given = Seen.of(self.process, numbers, noise, at).in_order(_flags(accepted))
-        expected = self._expected_errors(numbers, root, cross + at.unknown.T @ self._target.unknown)
+        white = torch.linalg.solve_triangular(
+            root, numbers.there(at.between(target)) @ self.around.errors[1], upper=False
+        )
+        expected = self._expected_errors(numbers, white, target)
         for number in range(before, len(window)):
             row, single, typical = window[number], given(number, number + 1), self.typical
             readings = data.rows(_numbers(number, number + 1))
@@ -348,44 +344,33 @@ class CampaignModel:
             if change is not None or not fits:
                 break
         self.window = window[: before + len(verdicts) - first]
-        self.numbers, self.noise, self._at, self._cross = numbers, noise, at, cross
+        self.numbers, self.noise = numbers, noise
         self._let_go(verdicts)
         self._learn(verdicts)
 
-    def _expected_errors(self, numbers: Numbers, root: Tensor, cross: Tensor) -> list[float]:
-        """RMS error over the target after each of some rows, m, whose numbers have a covariance (N R, T r) with it.
-
-        ``root``: lower Cholesky factor of their own.
-        """
-        compared = self.around.errors[1]
-        white = torch.linalg.solve_triangular(root, numbers.there(cross) @ compared, upper=False)
+    def _expected_errors(self, numbers: Numbers, white: Tensor, target: Features) -> list[float]:
+        """RMS error over the target after each of some rows, m; ``white``: of their numbers, L^-1 cov with it."""
         last = numbers.owner.bincount(minlength=numbers.shape[0]).cumsum(0) - 1
-        lowered = white.square().sum(1).cumsum(0)[last] / len(compared)
-        variance = self.around.covariance(self._target).diagonal().mean() - lowered
+        variance = (
+            self.around.covariance(target).diagonal().mean() - white.square().sum(1).cumsum(0)[last] / white.shape[1]
+        )
         return (3 * variance).clamp(min=0).sqrt().tolist()
 
     def _let_go(self, verdicts: Sequence[Verdict]) -> None:
         """Keep as many of the last rows as are looked at together; those of the others that are accepted are known."""
-        size, count = self.numbers.shape[1], max(0, len(self.window) - gates.WINDOW - 1)
-        gone, kept = (self.window[:count], _numbers(count, len(self.window)))
-        rows = _flags([verdicts[row].accepted for row in gone]).nonzero()[:, 0]
+        count = max(0, len(self.window) - gates.WINDOW - 1)
+        kept = _numbers(count, len(self.window))
+        rows = _flags([verdicts[row].accepted for row in self.window[:count]]).nonzero()[:, 0]
         if len(rows):
-            at = (rows[:, None] * size + torch.arange(size, device=HOST)).flatten()
-            oldest, before = self.numbers.rows(rows), self.process.size
-            self.process = self.process.given(oldest, self.noise[rows], self._at.rows(rows))
-            blocks = (self._at, self._at.by_fields[at]), (self._target, self._cross[at])
-            self._at, self._target = (self.process.features(part.at, part, oldest.there(own)) for part, own in blocks)
-            self._cross = self._cross - self._at.known[before:].T @ self._target.known[before:]
+            self.process = self.process.given(self.numbers.rows(rows), self.noise[rows])
         self.window, self.numbers, self.noise = self.window[count:], self.numbers.rows(kept), self.noise[kept]
-        self._at, self._cross = self._at.rows(kept), self._cross[count * size : (count + len(kept)) * size]
 
     def _learn(self, verdicts: Sequence[Verdict]) -> None:
         """What is known now. Of the last rows those not accepted tell nothing."""
         accepted = _flags([verdicts[row].accepted for row in self.window])
         noise = without_hidden(self.noise, accepted[:, None].expand(self.noise.shape[:2]))
-        self.now = self.process.given(self.numbers, noise, self._at)
-        target = self.now.features(self._target.at, self._target, self.numbers.there(self._cross))
-        self.covariance = self.around.covariance(target)
+        self.now = self.process.given(self.numbers, noise)
+        self.covariance = self.around.covariance(self.now.features(self.around.errors[0]))
 
     def _cause(self, table: Any, data: TangentData, view: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""

@@ -25,8 +25,8 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import Features, Process
+from diffeo_calib.regression.linear_rows import Evidence
 from diffeo_calib.sensors.devices import Hypothesis
 
 

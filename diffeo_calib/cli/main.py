@@ -38,10 +38,19 @@ from typing import Annotated, Any, TextIO
 import typer
 from typer.core import TyperGroup
 
-from diffeo_calib.cli.console import INTERRUPTED, interrupts, log_lines, show
+from diffeo_calib.cli.console import (
+    EXIT_ERROR,
+    EXIT_INTERRUPTED,
+    INTERRUPTED,
+    check_outputs,
+    interrupts,
+    log_lines,
+    record,
+    remove_earlier,
+    show,
+)
 from diffeo_calib.cli.declarations import COMMANDS, Command
 from diffeo_calib.cli.options import CORNERS, has
-from diffeo_calib.cli.record import EXIT_ERROR, EXIT_INTERRUPTED, check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, as_written, printable, sentence
 from diffeo_calib.common.files import PROGRAM, read_regular
 
@@ -54,7 +63,12 @@ SUFFIX = ".toml"
 COMMAND, LIVE = "fit", "campaign"
 JOINED = ("rotation-std",)  # entries that may be lists of columns although the option can be repeated
 LONGEST_FILE = 1 << 20  # bytes: a file of options is short
-IN_FILE_OF = {"record": "images", "demo": "fit", "predict": "evaluate"}  # command -> that whose file holds its work
+IN_FILE_OF = {
+    "record": "images",
+    "demo": "fit",
+    "recalibrate": "fit",
+    "predict": "evaluate",
+}  # command -> that whose file holds its work
 GONE = {
     "compare": "write `recalibrate OLD OTHER` without -o",
     "report": "write `evaluate MODEL [CSV] --report PAGE`",

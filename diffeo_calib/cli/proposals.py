@@ -25,32 +25,21 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register_sockets, registered_geometry, spread
 from diffeo_calib.calibration.placing.readings import images_error, resting_rows, rough_error
+from diffeo_calib.cli import guesses
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.declarations import FitOptions
-from diffeo_calib.cli.guesses import (
-    LENS,
-    NAMED,
-    SOME_LENS,
-    Body,
-    JointColumns,
-    RowColumns,
-    Sheet,
-    guess_deviations,
-    in_other_units,
-    marker_of_lines,
-)
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.cli.tables import MeasuredTable, described
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
-from diffeo_calib.measurements.csv.joints import JointExpressions
+from diffeo_calib.measurements.csv.columns import JointExpressions
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, BESIDE, UNITS_PER_METRE, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import check_poses, measured_positions
+from diffeo_calib.sensors.kinds import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0  # a way is clear if every other one leaves more by this factor
 LARGEST_RESIDUAL = 0.1  # median residual, as a share of the spread, above which no way is right
@@ -65,7 +54,7 @@ LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
 UNITS = "length", "angle", "joint_length", "camera_on_tool"
 """Options that :meth:`Source.in_units` tries, beside how a place is a distance and two angles."""
-COLUMNS = "joints", "robot_pose", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED
+COLUMNS = "joints", "robot_pose", "position", "marker", "socket", "rotation", "std", "reading", "by", *guesses.NAMED
 """Options that name columns."""
 REASONS = {
     **dict.fromkeys(("angle", "rotation_angle", "decimal"), "the same"),
@@ -86,9 +75,9 @@ REASONS = {
 class Source:
     """One way to read a table, with the reasons for its options."""
 
-    sheet: Sheet  # the table
+    sheet: guesses.Sheet  # the table
     robot: Tree  # whose joints it has, or a machine with its poses
-    bodies: Sequence[Body]  # columns of the places that were measured
+    bodies: Sequence[guesses.Body]  # columns of the places that were measured
     options: FitOptions  # with which `fit` reads it so
     why: Mapping[str, str]  # option -> its reason
     asked: Mapping[str, Mapping[Any, str]] = field(default_factory=dict)  # option -> values to choose from, and reasons
@@ -128,7 +117,7 @@ class Source:
     @cached_property
     def data(self) -> Any:
         """The rows, of any kinds."""
-        reading = [text.replace(LENS, SOME_LENS) for text in self.options.reading or ()]
+        reading = [text.replace(guesses.LENS, guesses.SOME_LENS) for text in self.options.reading or ()]
         given = replace(self.options, reading=reading, **dict.fromkeys(BESIDE))
         table = MeasuredTable(self.sheet.path, described(given), "keep")
         return table.rows(self.robot, given.tip or self.robot.tips)
@@ -170,7 +159,7 @@ class Source:
     @property
     def without_length(self) -> bool:
         """Whether no column is a length."""
-        return not self.bodies and all(text.endswith(LENS) for text in self.options.reading or ())
+        return not self.bodies and all(text.endswith(guesses.LENS) for text in self.options.reading or ())
 
     @property
     def joints(self) -> list[str]:
@@ -213,7 +202,7 @@ class Source:
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
 
-def source_of(sheet: Sheet, robot: Tree, rows: RowColumns, /, **options: Any) -> Source:
+def source_of(sheet: guesses.Sheet, robot: Tree, rows: guesses.RowColumns, /, **options: Any) -> Source:
     """The table of a robot, what was measured, and other options."""
     output, report = (Path(sheet.path.stem + end) for end in (".safetensors", ".html"))
     options |= {**sheet.marks, **rows.options, "csv": sheet.path, "output": output, "report": report}
@@ -263,7 +252,7 @@ def reason(best: Source, *others: Source) -> str:
 # --- what one search each decides -------------------------------------------------------------------------------------
 
 
-def with_joint_columns(source: Source, series: Sequence[JointColumns]) -> Source:
+def with_joint_columns(source: Source, series: Sequence[guesses.JointColumns]) -> Source:
     """The columns of the joints: of those that names do not tell apart those that the nominal robot explains.
 
     Where it does not tell them apart either, each is a line that the user may choose.
@@ -289,13 +278,12 @@ def with_measured(source: Source) -> Source:
     With the column that names the marker of each row, if the nominal robot explains the rows by several alone, or some
     lines have no joint values.
     """
-    if names := marker_of_lines(source.sheet, source.joints):
+    if names := guesses.marker_of_lines(source.sheet, source.joints):
         why = "names the marker of each line: the first line alone of every pose holds its joint values"
         return source.into({"marker": why}, marker=names)
     several, tips = len(source.bodies) > 1, source.options.tip or ()
-    copies = in_other_units(source.sheet, source.bodies)
+    copies, counted = guesses.in_other_units(source.sheet, source.bodies), "(counted from 0)"
     of_each = (unmeasured_markers(source.robot, rows) for _, rows in source.positions() if several)
-    counted = "(counted from 0)"
     proved = ({marker: f"{words} {counted}" for marker, words, sure in every if sure} for every in of_each)
     copies = copies or next(filter(None, proved), dict[int, str]())
     if several and not copies and len(tips) < 2:  # perhaps in units of their own
@@ -463,7 +451,7 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
 
 def with_deviations(source: Source) -> Source:
     """With standard deviations of the positions, or a remark why there are none."""
-    names = guess_deviations(source.sheet.numbers, [body.place for body in source.bodies])
+    names = guesses.guess_deviations(source.sheet.numbers, [body.place for body in source.bodies])
     if names is None:
         return source
     weighted, measured = source.into(std=",".join(names)), None

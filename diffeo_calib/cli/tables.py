@@ -20,9 +20,9 @@ from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, shown, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
+from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joined import HeldFile, joined_file
-from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
 from diffeo_calib.measurements.poses import by_frame

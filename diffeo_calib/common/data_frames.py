@@ -10,7 +10,6 @@ Arrays that come from outside, as float64: all kinds that hold real numbers, and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -105,23 +104,6 @@ def _numbers(frame: Any, name: str, what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError) as error:
         text = f"column {name!r} of the data frame `{what}` cannot be read as numbers ({error})"
         raise InputError.of(text, fix="convert it to numbers, and remove rows without a value") from error
-
-
-def facts_html(title: str, facts: Mapping[str, object]) -> str:
-    """A title over names and values."""
-    return table_html(title, (), [[name, str(value)] for name, value in facts.items()])
-
-
-def table_html(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A title over a table; the first cell of a row is its name."""
-    left, right = 'style="text-align:left"', 'style="text-align:right"'
-    head = "".join(f"<th {right if k else left}>{escape(name)}</th>" for k, name in enumerate(header))
-    lines = [
-        "".join(f"<td {right if k and header else left}>{escape(cell)}</td>" for k, cell in enumerate(row))
-        for row in rows
-    ]
-    body = "".join(f"<tr>{line}</tr>" for line in ([head] if head else []) + lines)
-    return f"<div><strong>{escape(title)}</strong><table>{body}</table></div>"
 
 
 ARRAY_KINDS = {

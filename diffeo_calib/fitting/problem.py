@@ -112,7 +112,7 @@ class Problem:
         given = {"x": x, "y": y, "noise": noise, "prior_variance": prior_variance}
         if live := [name for name, value in given.items() if isinstance(value, Tensor) and value.requires_grad]:
             what = f"no gradient leads from a fit back to `{'`, `'.join(live)}`"
-            warn_user(sentence(what, fix="detach them, or compare fits by finite differences"))
+            warn_user(sentence(what, fix="detach them, and use `fit.gradients`"))
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal, self.observe = as_nominal(nominal), observe
@@ -265,7 +265,7 @@ class Problem:
 
     def slopes(self, deformation: Deformation) -> Tensor | None:
         """A = Dh at k1 of the data: (N, r, m); None if all coordinates were measured."""
-        return None if self.observe is None else self.observe.slope(self.coordinates(deformation)).detach()
+        return None if self.observe is None else self.observe.slope(self.coordinates(deformation))
 
     def energy(self, deformation: Deformation, values: Tensor | None = None) -> EnergyParts:
         """The energy of a deformation of this problem; differentiable once in its momenta.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf, isnan, nan
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -147,6 +148,24 @@ class Fit:
         """(c,) posterior mean of the shifts that rows share, in units of their prior deviations; see :class:`Noise`."""
         noise = self.problem.noise
         return torch.einsum("nmc,nm->c", noise.shared, noise.solve(self.residual))
+
+    def gradients(self, x: object, loss: Callable[[Tensor], Tensor]) -> Any:
+        """Derivatives of a loss of the model by measurements, noise and scales, with the fit following them.
+
+        Args:
+            x: (M, n) configurations, rad or m. loss: a torch function of k1(x) (M, m), m, to a scalar.
+
+        Returns:
+            a :class:`~diffeo_calib.fitting.gradients.FitGradients`.
+
+        Raises:
+            InputError: a fit that did not converge, of the Eulerian formulation, or with fewer control points than
+                data; x of the wrong shape, or a loss that is no scalar of its argument.
+            NumericalError: the iteration does not converge, since the fit is too far from linear.
+        """
+        from diffeo_calib.fitting.gradients import gradients  # noqa: PLC0415  # it builds on solvers
+
+        return gradients(self, x, loss)
 
     @property
     def status(self) -> str:

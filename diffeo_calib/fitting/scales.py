@@ -132,7 +132,12 @@ def _likeliest(problem: Problem, rows: Tensor, iterations: int) -> Problem:
             raise NumericalError.of(
                 "the covariance of the measurements", expected="positive definite", fix="raise `noise`"
             )
-    spec, factor = _scaled(problem.spec, logs.detach())
+    return rescaled(problem, logs.detach())
+
+
+def rescaled(problem: Problem, logs: Tensor) -> Problem:
+    """The problem with its scales times exp(logs): of the prior, the noise, the joint kernel and the task kernel."""
+    spec, factor = _scaled(problem.spec, logs)
     new_noise = None if problem.new_noise is None else factor * problem.new_noise
     noise = Noise(without_hidden(factor * problem.noise.covariance, problem.noise.visible), problem.noise.shared)
     return problem._with(spec=spec, noise=noise, new_noise=new_noise)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, number_of
-from diffeo_calib.common.data_frames import data_frame, facts_html, is_data_frame
+from diffeo_calib.common.data_frames import data_frame, is_data_frame
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import InputError, as_written, printable
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -245,25 +245,6 @@ class CalibratedKinematics:
 
     def __repr__(self) -> str:
         return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses)"
-
-    def _repr_html_(self) -> str:
-        """For notebooks: robot, measurements, errors at the fit and provenance."""
-        robot, made, summary = self.robot, self.provenance, self.summary
-        facts: dict[str, object] = {
-            "robot": f"{printable(robot.name)}, {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints",
-            "measured": measured_words(self),
-            "rows of the fit": len(self.configurations),
-        }
-        if summary is not None and summary.geometry_rms is not None and summary.leave_one_out_rms is not None:
-            facts["geometric calibration, RMS"] = f"{1e3 * summary.geometry_rms:.4f} mm on the rows of the fit"
-            facts["calibrated, RMS"] = f"{1e3 * summary.leave_one_out_rms:.4f} mm, each row predicted by all others"
-        if self.registration is not None:
-            facts["registered anew"] = f"{self.registration.rows} rows, RMS {1e3 * self.registration.rms_after:.4f} mm"
-        if made is not None:
-            facts["fitted"] = f"{made.date[:10]} with version {made.version}, table sha256 {made.table_sha256[:12]}"
-            if made.note:
-                facts["note"] = printable(made.note)
-        return facts_html("Calibrated kinematics", facts)
 
     def to_frame(self, q: Any) -> Any:
         """Predicted markers with the standard deviations of a new measurement, as a pandas.DataFrame in m.

@@ -197,11 +197,7 @@ class RegisteredMap(FittedMap):
 
 
 def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:
-    """Derivatives of k1 by shifts of its own points in the tip's frame, Dpsi R_tip: (N, 3 P, 3 P).
-
-    Args:
-        deformation: k1. points: its nominal map. at: its linearisation at N configurations.
-    """
+    """Derivatives of k1 by shifts of its own points in the tip's frame, Dpsi R_tip: (N, 3 P, 3 P)."""
     shifts = points.shifts(at.xi, deformation.momenta.theta)  # (N, 3 P, 3 P)
     by_points = at.task[0].effect  # Dpsi (N P, 3, 3)
     return (by_points @ shifts.view(len(by_points), 3, -1)).view(shifts.shape)

@@ -273,9 +273,6 @@ class Numbers:
         cells = torch.cat([self.cells, other.cells + self.shape.numel()])
         return Numbers(Linearisation.joined([self.at, other.at]), torch.cat([self.target, other.target]), cells)
 
-    def gram(self, at: Linearisation, first: int = 0) -> Tensor:
-        """Covariance by the fields of the numbers from one on with k1 at M' configurations: (M - first, M' m)."""
-        if not first:
-            return self.there(self.at.fields.gram(at.fields))
-        rows = torch.arange(int(self.owner[first]), self.shape[0], device=self.cells.device)
-        return self.at.rows(rows).fields.gram(at.fields)[self.cells[first:] - int(rows[0]) * self.shape[1]]
+    def gram(self, at: Linearisation) -> Tensor:
+        """Covariance by the fields of the numbers with k1 at M' configurations: (M, M' m)."""
+        return self.there(self.at.fields.gram(at.fields))

@@ -12,7 +12,6 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 
 NOISE_ADVICE = "raise `noise` or lower the kernels' variances"  # how to repair a matrix that float64 cannot factorise
-MOST_ADDED = 128  # rows of a factor that are kept apart from the first ones
 
 
 def lower_root(F: Tensor) -> Tensor:
@@ -25,32 +24,24 @@ def lower_root(F: Tensor) -> Tensor:
 
 
 class Factor:
-    """K = L L^T + H H^T of numbers with features H (M, K), L, W = L^-1 H and B: priors of metres cost no digits.
+    """K = L L^T + H H^T of numbers with features H (M, K): priors of metres cost no digits.
 
     Args:
-        first: lower Cholesky factor of the first numbers. W: (M, K). gram: (K, K) W^T W.
-        added: the rows of L below it (m, M), apart because copying it takes longer than a new row.
+        L: (M, M) lower Cholesky factor of K - H H^T. W: (M, K) L^-1 H.
     """
 
-    def __init__(self, first: Tensor, W: Tensor, gram: Tensor, added: Tensor | None = None) -> None:
-        self.first, self.W, self._gram = first, W, gram
-        self.added = first[:0] if added is None else added
-        eye = torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
-        self.B, info = torch.linalg.cholesky_ex(eye + gram)
+    def __init__(self, L: Tensor, W: Tensor) -> None:
+        self.L, self.W = L, W
+        self.B, info = torch.linalg.cholesky_ex(torch.eye(W.shape[1], dtype=W.dtype, device=W.device) + W.T @ W)
         if int(info):
             raise NumericalError.of("the covariance of the unknowns is not positive definite", fix=NOISE_ADVICE)
 
     @classmethod
     def of(cls, F: Tensor, H: Tensor) -> Factor:
-        """Factor F + H H^T.
-
-        Raises:
-            NumericalError: it is not positive definite in float64.
-        """
+        """Factor F + H H^T; NumericalError where it is not positive definite in float64."""
         with large_work(F.numel()):
             L = lower_root(F)
-            W = torch.linalg.solve_triangular(L, H, upper=False)
-            return cls(L, W, W.T @ W)
+            return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
 
     def joined(self, cross: Tensor, L: Tensor, W: Tensor) -> Factor:
         """The factor of these and m more numbers.
@@ -59,41 +50,13 @@ class Factor:
             cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
             W: (m, K) their rows.
         """
-        first, old = (self.first, self.added) if len(self.added) <= MOST_ADDED else (self.L, self.first[:0])
-        M = len(self.W)
-        added = L.new_zeros(len(old) + len(L), M + len(L))
-        added[: len(old), : old.shape[1]], added[len(old) :, :M], added[len(old) :, M:] = old, cross.T, L
-        return Factor(first, torch.cat([self.W, W]), self._gram + W.T @ W, added)
-
-    @cached_property
-    def L(self) -> Tensor:
-        """(M, M) lower Cholesky factor of K - H H^T."""
-        if not len(self.added):
-            return self.first
-        whole = self.first.new_zeros(len(self.W), len(self.W))
-        whole[: len(self.first), : len(self.first)], whole[len(self.first) :] = self.first, self.added
-        return whole
-
-    def further(self, values: Tensor, sooner: Tensor) -> Tensor:
-        """The rows of L^-1 values after the first n, ``sooner`` (n, k), from the values after n."""
-        start, M, parts = len(sooner), len(self.first), [sooner]
-        for n, rows in ((start, self.first[start:]), (max(start, M), self.added[max(start - M, 0) :])):
-            if len(rows):
-                sooner_rows = torch.cat(parts) if len(parts) > 1 else sooner
-                right = values[: len(rows)] - rows[:, :n] @ sooner_rows
-                parts.append(torch.linalg.solve_triangular(rows[:, n:], right, upper=False))
-                values = values[len(rows) :]
-        return torch.cat(parts[1:])
-
-    def below(self, n: int) -> Tensor:
-        """The block of L of the numbers after the first n."""
-        M = len(self.first)
-        return self.added[n - M :, n:] if n >= M else self.L[n:, n:]
+        rows = torch.cat([torch.nn.functional.pad(self.L, (0, len(L))), torch.cat([cross.T, L], 1)])
+        return Factor(rows, torch.cat([self.W, W]))
 
     def beside(self, H: Tensor) -> Factor:
         """The factor of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
         W, V = torch.cat([self.W, self.white(H)], 1), self.inverse @ H
-        other = Factor(self.first, W, W.T @ W, self.added)
+        other = Factor(self.L, W)
         root = torch.linalg.cholesky(torch.eye(H.shape[1], dtype=H.dtype, device=H.device) + H.T @ V)
         Y = torch.linalg.solve_triangular(root, V.T, upper=False)
         vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)
@@ -101,8 +64,7 @@ class Factor:
 
     def with_features(self, columns: Tensor, H: Tensor) -> Factor:
         """The factor with other features (M, k) in some of its columns (k,)."""
-        W = self.W.index_copy(1, columns, self.white(H))
-        return Factor(self.first, W, W.T @ W, self.added)
+        return Factor(self.L, self.W.index_copy(1, columns, self.white(H)))
 
     @property
     def matrix(self) -> Tensor:
@@ -112,7 +74,8 @@ class Factor:
 
     def white(self, values: Tensor) -> Tensor:
         """L^-1 values (M, k)."""
-        return self.further(values, values[:0])
+        with large_work(values.numel()):
+            return torch.linalg.solve_triangular(self.L, values, upper=False)
 
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 values (M, k)."""

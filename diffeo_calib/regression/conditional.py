@@ -59,23 +59,9 @@ class Features:
 
     def rows(self, index: Tensor) -> Features:
         """Features of some configurations (B,)."""
-        M, parts = len(self.at.sensitivity), (self.known, self.unknown, vars(self).get("mixed", self.unknown))
-        known, unknown, mixed = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in parts)
-        chosen = Features(self.at.rows(index), known, unknown)
-        vars(chosen)["mixed"] = mixed
-        if "by_fields" in vars(self):
-            by_fields = self.by_fields.unflatten(0, (M, -1))[index].flatten(0, 1)
-            vars(chosen)["by_fields"] = by_fields.unflatten(1, (M, -1))[:, index].flatten(1)
-        return chosen
-
-    def followed_by(self, other: Features, cross: Tensor) -> Features:
-        """Features of these configurations and others by the same process; ``cross``: :meth:`by_fields_with` them."""
-        parts = [(part.known, part.unknown, vars(part)["mixed"]) for part in (self, other)]
-        known, unknown, mixed = (torch.cat(both, 1) for both in zip(*parts, strict=True))
-        joined = Features(Linearisation.joined([self.at, other.at]), known, unknown)
-        by_fields = torch.cat([torch.cat([self.by_fields, cross], 1), torch.cat([cross.T, other.by_fields], 1)])
-        vars(joined).update(mixed=mixed, by_fields=by_fields)
-        return joined
+        M = len(self.at.sensitivity)
+        parts = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in (self.known, self.unknown))
+        return Features(self.at.rows(index), *parts)
 
     def blocks(self) -> Tensor:
         """Covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
@@ -86,15 +72,9 @@ class Features:
         """Covariance (M r, M' r') with others, by default themselves."""
         if other is None:
             return self.by_fields.addmm(self.unknown.T, self.unknown)
-        by_fields = self.by_fields_with(other)
-        with large_work(by_fields.numel()):
-            return by_fields.addmm_(self.unknown.T, other.unknown)
-
-    def by_fields_with(self, other: Features) -> Tensor:
-        """(M r, M' r') of :attr:`by_fields` with others."""
         fields = self.at.fields.gram(other.at.fields)
         with large_work(fields.numel()):
-            return fields.addmm_(self.known.T, other.known, alpha=-1.0)
+            return fields.addmm_(self.known.T, other.known, alpha=-1.0).addmm_(self.unknown.T, other.unknown)
 
 
 class Conditional(ABC):
@@ -210,7 +190,7 @@ class Process(Conditional):
     def given(self, new: Numbers, noise: Tensor, at: Features | None = None) -> Process:
         at = self.features(new.at) if at is None else at
         L, k = lower_root(new.with_noise(at.by_fields, noise)), self.known.shape[1]
-        known, unknown = new.there(at.known.T), new.there(vars(at)["mixed"].T)
+        known, unknown = new.there(at.known.T), new.there((self.factor.B @ at.unknown).T)
         right = torch.cat([(new.target - known[:, k:] @ self.alpha)[:, None], unknown], 1)
         right = torch.linalg.solve_triangular(L, right, upper=False)
         return replace(
@@ -226,36 +206,12 @@ class Process(Conditional):
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
-    def with_effects(self, unknowns: Tensor, E: Tensor) -> Process:
-        """Rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
-        return replace(self, factor=self.factor.with_features(unknowns, E))
-
-    def features(self, at: Linearisation, sooner: Features | None = None, cross: Tensor | None = None) -> Features:
-        """Features of a linearisation.
-
-        Args:
-            sooner: the same by the first of these rows alone. cross: covariance of the numbers of the others with it by
-                the fields, given the first ones, see :meth:`Features.by_fields_with`; computed by default.
-        """
-        before = self.before.features(at) if sooner is None else sooner
-        k, mixed = self.known.shape[1], before.unknown
-        if sooner is not None:
-            mixed = vars(sooner)["mixed"]
-        if (n := len(before.known) - k) == len(self.alpha):
-            return before
-        if cross is None:
-            cross = self.numbers.gram(at, n).addmm_(self.known[n:], before.known[:k], alpha=-1.0)
-            with large_work(cross.numel()):
-                more = self.factor.further(cross, before.known[k:])
-        else:
-            more = torch.linalg.solve_triangular(self.factor.below(n), cross, upper=False)
-        mixed = mixed - self.factor.W[n:].T @ more
-        unknown = torch.linalg.solve_triangular(self.factor.B, mixed, upper=False)
-        new = Features(at, torch.cat([before.known, more]), unknown)
-        vars(new)["mixed"] = mixed  # D before the factor of the unknowns, to which later rows add theirs
-        if "by_fields" in vars(before):
-            vars(new)["by_fields"] = before.by_fields.addmm(more.T, more, alpha=-1.0)
-        return new
+    def features(self, at: Linearisation) -> Features:
+        before = self.before.features(at)
+        cross = self.numbers.gram(at).addmm_(self.known, before.known, alpha=-1.0)
+        more = self.factor.white(cross)
+        unknown = torch.linalg.solve_triangular(self.factor.B, before.unknown - self.factor.W.T @ more, upper=False)
+        return Features(at, torch.cat([before.known, more]), unknown)
 
     def mean(self, at: Features) -> Tensor:
         """(M r,) of numbers, with these features."""

@@ -14,9 +14,9 @@ from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.reports.analysis.findings import Findings, find
-from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import sections, sentences
+from diffeo_calib.reports.analysis.findings import Findings, Kinematics, find
+from diffeo_calib.reports.html import sections
+from diffeo_calib.reports.html import sections as sentences
 from diffeo_calib.reports.html.document import page
 from diffeo_calib.sensors.coordinates import Places
 

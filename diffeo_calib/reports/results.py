@@ -149,9 +149,8 @@ RESULTS: dict[str, tuple[Any, str]] = {
         "depth.",
     ),
     "sockets": (
-        entries({"positions_m": {str: [float]}, "left_out_spread_m": float}),
-        "Sockets after a fit, in the measuring frame (the robot's base if no position was measured), and every place "
-        "as predicted by the others (a spread, no error).",
+        entries({"positions_m": {str: [float]}}),
+        "Sockets after a fit, in the measuring frame (the robot's base if no position was measured).",
     ),
     "camera": (CAMERA, ""),
     "cameras": ({str: CAMERA}, "The same of each of several cameras, by its name."),

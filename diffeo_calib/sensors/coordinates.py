@@ -23,9 +23,8 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations, socket_errors
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.kinds import Coordinates, kind_of, with_positions
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
-from diffeo_calib.sensors.tables import Coordinates, with_positions
 
 KNOWN_DEVIATION = 1e-8  # prior deviations of increments below this, m or rad, are those of numbers that are known
 NUMBERS_OF_A_SOCKET = 3

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.data_frames import data_frame, table_html
+from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.quantiles import known, quantile
@@ -182,15 +182,6 @@ class Evaluation:
         ]
         text = f"; {self.numbers} numbers found from these rows" * (self.numbers > 0)
         return f"Evaluation({'; '.join(sizes)}{text})"
-
-    def _repr_html_(self) -> str:
-        """A table of the errors, for notebooks."""
-        words = {ERRORS: "position", ORIENTATION: "orientation"}
-        rows = [
-            [f"{words.get(part.what, part.title)} [{part.shown[0]}]", *(f"{value:.4f}" for value in part.sizes)]
-            for part in self.each
-        ]
-        return table_html(f"Errors of {len(self.errors)} rows", ("", *SIZES), rows)
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """One entry for every row and body, as :meth:`Evaluations.to_frame` writes them: mm, px, deg."""

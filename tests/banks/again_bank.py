@@ -79,11 +79,6 @@ def distance(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
     return reading("distance", arm, rows, seed)
 
 
-def mixture(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
-    """Half of the rows by a tracker, which sees the ball as a marker of its own, half in sockets."""
-    return dc.Measurements.joined([positions(arm, rows // 2, seed), sockets(arm, rows // 2, seed)])
-
-
 class Again(NamedTuple):
     """How the arm is measured at first, how again, and by how many rows."""
 
@@ -94,19 +89,12 @@ class Again(NamedTuple):
 
 OTHERWISE = {
     "positions, then two sessions": Again(positions, sessions),
-    "mixture, then a tracker": Again(mixture, positions),
     "positions, then sockets": Again(positions, sockets),
     "positions, then heights": Again(positions, height, 60),
     "heights, then a tracker": Again(height, positions),
     "sockets, then distances": Again(sockets, distance, 60),
 }
 """Measured in one way and then in another."""
-WORN_ROWS = {
-    "payloads": Again(payloads, payloads),
-    "heights": Again(height, height),
-    "positions, then sockets": OTHERWISE["positions, then sockets"],
-}
-"""Rows that show which joint has worn; 60 rows in sockets leave 0.5 mm, and distances show a change of no joint."""
 
 
 def arm(markers: int = 1) -> SimulatedArm:

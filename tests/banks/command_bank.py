@@ -42,7 +42,7 @@ Edit = Callable[[list[list[str]]], object]
 
 def leave_undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages keep their sections, numbers and labels; their pictures, which take most of the time, are empty."""
-    monkeypatch.setattr("diffeo_calib.reports.analysis.stages.CONFIGURATIONS", FEW_CONFIGURATIONS)
+    monkeypatch.setattr("diffeo_calib.reports.analysis.findings.CONFIGURATIONS", FEW_CONFIGURATIONS)
     monkeypatch.setattr("diffeo_calib.reports.html.document.Picture.svg", lambda _: UNDRAWN)
 
 

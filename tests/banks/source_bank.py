@@ -26,7 +26,7 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import GearLine
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import twist_transform
 
 Truth = Callable[[Tensor], Tensor]
 """Joint values (N, n) -> true markers (N, P, 3) in the order of the model's, m, in any frame that does not move."""
@@ -103,15 +103,16 @@ def _tips() -> Source:
     return Source(robot, rows, usual_scales(robot), truth, 0.2)
 
 
+MOVED = twist_transform(torch.tensor([5e-3, 2e-3, -4e-3, 1e-3, -2e-3, 0.5e-3], dtype=torch.float64))
+"""From the frame of the larger session to that of the other one."""
+
+
 def _sessions(rows: int, *, wrong: bool = False) -> Source:
     """The device was moved once; its larger session is the second one. One row may be wrong."""
     arm = SimulatedArm(seed=5, markers=2)
     q, points = arm.measure(rows, seed=1)
-    moved = torch.eye(4, dtype=torch.float64)
-    moved[:3, :3] = rotation(torch.tensor([1e-3, -2e-3, 0.5e-3], dtype=torch.float64))
-    moved[:3, 3] = torch.tensor([5e-3, 2e-3, -4e-3], dtype=torch.float64)
     first = torch.arange(rows) % 5 < 2
-    points = torch.where(first[:, None, None], points @ moved[:3, :3].mT + moved[:3, 3], points)
+    points = torch.where(first[:, None, None], points @ MOVED[:3, :3].mT + MOVED[:3, 3], points)
     points[20, 0, 0] += 0.05 * wrong
     names = ["Monday" if one else "Friday" for one in first.tolist()]
     return of_arm(arm, dc.Measurements(q, points, arm.nominal.joint_names).with_sessions(names), 0.25, (0, 1))

@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.placing.sessions import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
+from diffeo_calib.calibration.placing.placement import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat

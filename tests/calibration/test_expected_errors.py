@@ -14,7 +14,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.expected_errors import ExpectedError, OpenPlaces, expected_errors
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.reports.analysis.stages import stages_of
+from diffeo_calib.reports.analysis.findings import stages_of
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any
-
 import pytest
 import torch
 from commanded_bank import BOARD, CAMERA, drawn, flange
@@ -71,22 +68,11 @@ def test_the_other_direction_is_named(seen: CameraArm) -> None:
         dc.calibrate(seen.arm.nominal, dc.Measurements.from_poses(data.q, held(data.poses), camera_on_tool=True))
 
 
-NEW_ROWS = 40
-
-
-@cache
-def head() -> SeeingHead:
-    return SeeingHead.drawn(60 + NEW_ROWS)
-
-
-@cache
-def calibrated() -> Any:
-    return dc.calibrate(head().robot, head().images(50, 0.1), hyperparameters=usual_scales(head().robot))
-
-
 @pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 def test_the_optical_frame_is_where_it_is_in_the_link_of_the_camera() -> None:
-    own = HandEye.of(calibrated().model, camera_on_tool=False).camera
+    head = SeeingHead.drawn(100)
+    model = dc.calibrate(head.robot, head.images(50, 0.1), hyperparameters=usual_scales(head.robot)).model
+    own = HandEye.of(model, camera_on_tool=False).camera
     truth = twist_transform(torch.tensor(CAMERA_AWAY, dtype=torch.float64))
     assert own.link == HEAD_CAMERA
     assert bool(((own.pose - truth)[:3, 3].abs() < 4 * own.deviations[:3]).all())

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from product_bank import Case, ur10_measurements
+from product_bank import Case, covered, ur10_measurements
 
 import diffeo_calib as dc
 
@@ -24,14 +23,6 @@ def ur10(ur10_folder: Path) -> Case:
     return Case(robot, train, test, dc.calibrate(robot, train))
 
 
-def coverage(case: Case) -> float:
-    """Share of the held-out rows that lie in their 95 % regions."""
-    mean, covariance = case.model.predict(case.test.q)
-    error = (case.test.points - mean)[..., None]
-    distance = (error.mT @ torch.linalg.solve(covariance, error)).flatten()
-    return float((distance < 7.8147).double().mean())
-
-
 def test_held_out_errors(ur10: Case) -> None:
     for name, stage in ur10.result.stages.items():
         assert 1e3 * dc.evaluate(stage, ur10.test).rms <= LARGEST[name], name
@@ -41,7 +32,7 @@ def test_the_fit_converges_and_its_deviations_hold(ur10: Case) -> None:
     fit = ur10.result.fit
     assert fit.converged
     assert max(fit.coupling_residual, fit.end_residual) <= 1e-4
-    assert 0.92 < coverage(ur10) < 0.99
+    assert 0.92 < covered(ur10.model, ur10.test) < 0.99
     assert len(ur10.result.outliers) <= 0.02 * len(ur10.train)  # gross errors are not invented
     assert ur10.result.left_out_rms == pytest.approx(ur10.held_out()[2], rel=0.25)
 

@@ -22,8 +22,8 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     warn_of_joints_below_tip,
 )
 from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.measurements.csv.columns import JointExpressions
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Joint, SimulatedArm
 from diffeo_calib.robots.se3 import transforms

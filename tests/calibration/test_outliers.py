@@ -23,7 +23,6 @@ from diffeo_calib.calibration.diagnostics import judged_rows
 from diffeo_calib.calibration.diagnostics.judged_rows import FAR, Outlier, block_text, contradicted, excluded, steps_of
 from diffeo_calib.calibration.diagnostics.likely_mistakes import out_of_step
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -256,30 +255,15 @@ SHIFT_M = 8e-4
 RESTING = SimulatedArm(seed=2)
 
 
-def in_their_sockets(seed: int, places: int) -> dc.Measurements:
-    """The sockets of three places lie near a plane as those of any three do."""
-    rows, names = rest_in_sockets(RESTING, seed=seed, places=places, rows=10), RESTING.nominal.joint_names
-    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.05}, distance_std=1e-5)
-
-
-@pytest.fixture(scope="module")
-def result() -> Any:
-    """Of rows two of which are wrong; nobody says that a plane is too little for the workspace."""
+def test_wrong_rows_are_named() -> None:
+    """At their joint values the ball is 0.8 mm beside its socket; nobody says that a plane is too little."""
+    rows, names = rest_in_sockets(RESTING, seed=2, places=3, rows=10), RESTING.nominal.joint_names
+    away = torch.tensor([0.0, SHIFT_M, 0.0], dtype=rows.q.dtype)
+    rows.q[WRONG] += torch.linalg.pinv(RESTING.truth.jacobian(rows.q[WRONG])[:, 0]) @ away
+    data = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.05}, distance_std=1e-5)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*lie near.*")
-        return dc.calibrate(RESTING.nominal, moved(in_their_sockets(2, 3), WRONG), hyperparameters=scales())
-
-
-def moved(data: dc.Measurements, rows: list[int]) -> dc.Measurements:
-    """Some rows with joint values at which the ball is 0.8 mm beside its socket."""
-    q = data.q.clone()
-    slopes = RESTING.truth.jacobian(q[rows])[:, 0]
-    away = torch.tensor([0.0, SHIFT_M, 0.0], dtype=q.dtype)
-    q[rows] += torch.linalg.pinv(slopes) @ away
-    return with_attributes(data, q=q)
-
-
-def test_wrong_rows_are_named(result: Any) -> None:
+        result: Any = dc.calibrate(RESTING.nominal, data, hyperparameters=scales())
     assert sorted(one.row for one in result.outliers) == WRONG
     assert all(one.weight < 0.3 for one in result.outliers)
     assert all(one.distance == pytest.approx(SHIFT_M, rel=0.4) for one in result.outliers)
@@ -288,21 +272,12 @@ def test_wrong_rows_are_named(result: Any) -> None:
 # --- rows out of step with their joints -------------------------------------------------------------------------------
 
 
-def shifted(data: dc.Measurements, first: int, lag: int) -> dc.Measurements:
-    """The measured values from row ``first`` on belong to the joints ``lag`` rows below; row 0 is line 2."""
-    wanted = torch.arange(len(data))
-    wanted[first:] += lag
-    kept = wanted < len(data)
-    lines = torch.arange(2, len(data) + 2)[kept].tolist()
-    return dc.Measurements(data.q[kept], data.points[wanted[kept]]).with_line_numbers(lines)
-
-
-@pytest.mark.slow
 def test_a_table_that_is_out_of_step_is_refused() -> None:
     arm, train, _ = simulated(40)
+    points = torch.cat([train.points[:20], train.points[19:-1]])
     words = "do not fit this robot: from line 22 on the measured values belong to the joints 1 line above: got .* rows"
     with pytest.raises(MeasurementError, match=words):
-        dc.calibrate(arm.nominal, shifted(train, 20, -1))
+        dc.calibrate(arm.nominal, dc.Measurements(train.q, points).with_line_numbers(range(2, 42)))
 
 
 NOISE = 1e-3

@@ -1,19 +1,34 @@
-"""Planned poses: the greedy choice against brute force, what is known before it, and whether expectations come true."""
+"""Planned poses: the greedy choice against brute force, for what will measure, and whether expectations come true."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import two_arms_bank
+from kind_bank import Kind, kind_named, marked
 from product_bank import Case
+from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, camera_arm, fixed_camera_arm, seen_corners, true_camera
 from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning.candidates import candidates
+from diffeo_calib.calibration.planning.sensors import BoardImages, sensor_of
+from diffeo_calib.cameras.images import Images, sees, shown, sighted
+from diffeo_calib.cameras.images import expected as expected_errors
+from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 
@@ -139,3 +154,255 @@ def test_mistakes_are_one_sentence(arm: Case) -> None:
         ("`free`: expected None, 'base', 'marker', 'both', got 'tracker'", planned(model, free="tracker")),
         ("`marker` belongs to a robot", planned(model, marker=[0.0, 0.0, 0.1])),
     )
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+STEP = 1e-6
+ARM = SimulatedArm(seed=0)
+"""That of the bank's readings."""
+
+
+every_kind = pytest.mark.parametrize("name", marked("distances", "heights", "images"))
+
+
+def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of a reading by the point and by all increments of unit prior, by central differences."""
+    wide = replace(devices, deviations=z.new_tensor(devices.prior()).expand_as(devices.deviations))
+
+    def read(point: Tensor, increments: Tensor) -> Tensor:
+        return wide.shifted(increments).observation(torch.tensor([number])).value(point[None])[0]
+
+    none = z.new_zeros(devices.freedom)
+
+    def differences(values: Tensor, of: Any) -> Tensor:
+        unit = STEP * torch.eye(len(values), dtype=z.dtype)
+        return torch.stack([(of(values + h) - of(values - h)) / (2 * STEP) for h in unit], 1)
+
+    return differences(z, lambda point: read(point, none)), differences(none, lambda shifts: read(z, shifts))
+
+
+def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[float]:
+    """RMS error over q after 0, 1, ... readings (row, device), after a rigid fit: the whole covariance inverted."""
+    fitted_map, devices = result.model.map, result.placement[0].devices
+    z, at = fitted_map.geodesic.linearised_value(q)
+    data = fitted_map.geodesic.linearise(fitted_map.x).projected(fitted_map.slopes)
+    shared = fitted_map.noise.shared.flatten(0, 1)
+    count = shared.shape[1]
+    inner = data.gram() + torch.block_diag(*fitted_map.noise.covariance) + shared @ shared.T
+    cross = torch.cat([data.gram(at).T, shared.T])  # coordinates, then shifts
+    K = torch.block_diag(at.gram(), torch.eye(count, dtype=q.dtype)) - cross @ torch.linalg.solve(inner, cross.T)
+    B = frame_slopes(z[:, None], z.mean(0)).flatten(0, 1)
+    P = torch.eye(len(B), dtype=q.dtype) - B @ torch.linalg.pinv(B)
+
+    def rms() -> float:
+        return float((P @ K[: len(B), : len(B)] @ P).trace() / len(q)) ** 0.5
+
+    found = [rms()]
+    for row, number in taken:
+        A, D = slopes_of(devices, number, z[row])
+        H = torch.zeros(len(A), len(K), dtype=q.dtype)
+        H[:, 3 * row : 3 * row + 3], H[:, len(B) :] = A, D
+        R = fitted_map.noise.covariance[0]  # all rows are measured alike
+        K = K - K @ H.T @ torch.linalg.solve(H @ K @ H.T + R, H @ K)
+        found.append(rms())
+    return found
+
+
+@every_kind
+def test_devices_of_a_fit_against_the_whole_covariance(name: str) -> None:
+    """Where the devices are and what their rows share is read off the map."""
+    result = kind_named(name).result
+    q = ARM.sample(20, seed=8)
+    plan = dc.plan(result.model, q, 5)
+    sensors: Any = sensor_of(result.model)
+    known = result.placement[0].devices.constants
+    told = slice(0, 3 if name == "heights" else None)  # the distance of a plane changes no slope
+    found = {name: device.devices.constants for one in sensors for name, device in one.devices.items()}
+    own = {name: int((known - constants)[:, told].norm(dim=1).argmin()) for name, constants in found.items()}
+    order = plan.rank.argsort()
+    taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]
+    expected = torch.tensor(naive_rms(result, q, taken), dtype=torch.float64)
+    torch.testing.assert_close(plan.expected_rms, expected, rtol=1e-3, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "sensor"), [("images of a board", dc.Sensor.positions()), ("two cameras", dc.Sensor.poses())]
+)
+def test_a_tracker_beside_cameras_stands_anywhere(name: str, sensor: Any) -> None:
+    kind = kind_named(name)
+    rms = dc.plan(kind.model, kind.q(60), 12, sensor=sensor).expected_rms
+    assert float(rms[1]) > 0.999 * float(rms[0])
+    assert float(rms[12]) < 0.95 * float(rms[0])
+
+
+def test_a_camera_measures_what_it_sees() -> None:
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(100, seed=8)
+    sensor = dc.Sensor.images([[2.0, 0.0, 0.6, 0.5, 0.0, 0.6]])
+    plan = dc.plan(arm.nominal, q, 5, sensor=sensor, marker=(0.0, 0.0, 0.1))
+    T = arm.nominal(plan.q)
+    line = T[:, :3, 3] + 0.1 * T[:, :3, 2] - torch.tensor([2.0, 0.0, 0.6], dtype=torch.float64)
+    assert bool((-line[:, 0] > 0.87 * line.norm(dim=1)).all())
+    with pytest.raises(dc.DiffeoCalibError, match="candidates that can be measured: expected at least 100"):
+        dc.plan(arm.nominal, q, 100, sensor=sensor)
+
+
+@pytest.mark.parametrize("name", marked("heights", "mixture", "two cameras on the tool"))
+def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) -> None:
+    """The devices under their names; no place on the tool is open that no row of the registration could tell."""
+    kind = kind_named(name)
+    names = {f"socket {k}" for k in range(1, 9)} | {"positions"}
+    names |= {word for own in kind.model.placement for each in own.names for word in (each, f"{own.kind} {each}")}
+    before = float(dc.plan(kind.model, kind.q(30), 1).expected_rms[0])
+    for model in (kind.recalibrated.model, kind.registered):
+        found = dc.plan(model, kind.q(30), 3)
+        if model.registration is not None:
+            assert float(model.map.new_noise.trace()) >= 0.9 * float(model.registration.noise.trace())
+        assert set(found.devices) <= names
+        assert float(found.expected_rms[3]) <= float(found.expected_rms[0]) < 2.5 * before
+
+
+@pytest.mark.slow
+def test_poses_of_a_ball_in_sockets() -> None:
+    kind = kind_named("ball in sockets")
+    (placed,), sensors = kind.model.placement, sensor_of(kind.model)
+    places: Any = torch.cat([one.reached(kind.model.geometry.base)["places"] for one in sensors])
+    ball = kind.model.geometry.tool[-1]
+    q = dc.candidates(kind.robot, 40, places=places, ball=ball)
+    T = kind.robot(q)
+    points = T[:, :3, :3] @ ball + T[:, :3, 3]
+    torch.testing.assert_close(points, places[torch.cdist(points, places).argmin(1)], rtol=0, atol=1e-4)
+    plan = dc.plan(kind.model, q, 6)
+    assert set(plan.devices) <= set(placed.names)
+    assert float(plan.expected_rms[6]) < float(plan.expected_rms[0])
+    new = dc.plan(kind.model, q, 6, sensor=dc.Sensor.sockets(places))
+    assert float(new.expected_rms[6]) > float(plan.expected_rms[6])
+    with pytest.raises(dc.DiffeoCalibError, match="candidates that can be measured"):
+        dc.plan(kind.model, kind.q(40), 6)
+
+
+def test_two_tips_are_planned_together(tmp_path: Path) -> None:
+    robot, up = two_arms_bank.robot(tmp_path), dc.Tracker((0.0, 0.0, 8.0), half_angle=2.0)
+    q = dc.candidates(robot, 60, tracker=up, floor=0.1)
+    still = q.clone()
+    still[:, 3:] = 0.3  # the right arm
+
+    def rms(rows: Tensor, count: int = 8, **how: Any) -> float:
+        return float(dc.plan(robot, rows, 8, target=q, **how).expected_rms[count])
+
+    assert rms(q) != rms(q, marker={"left": (0.1, 0.0, 0.1)})
+    assert rms(q) < 0.7 * rms(still)
+    assert rms(q, sensor=dc.Sensor.poses()) < rms(q, 4, sensor=dc.Sensor.poses())
+
+
+@pytest.mark.slow
+def test_payload_of_the_plan() -> None:
+    kind = kind_named("payloads")
+    none, heavy = (dc.plan(kind.model.with_payload(mass), kind.q(30), 4) for mass in (0.0, 4.0))
+    assert (none.payload, heavy.payload) == (0.0, 4.0)
+    assert float(none.expected_rms[0]) != float(heavy.expected_rms[0])
+
+
+def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
+    q, tracker = arm.train.q, dc.Sensor.positions()
+    found = dc.Sensor.distances([[5.0, 0.0, 0.0]], 1e-5)
+    assert len(dc.plan(arm.model, q, 3, sensor=found)) == 3
+    assert dc.plan(arm.model, q, 2, sensor=dc.Sensor.positions(1e-4)).noise_rms == pytest.approx(3**0.5 * 1e-4)
+
+    def planned(sensor: Any, **more: Any) -> Callable[[], object]:
+        return lambda: dc.plan(arm.model, q, 3, sensor=sensor, **more)
+
+    refused(
+        ("`sensor`: expected a dc.Sensor", planned("tracker")),
+        ("poses of a robot that is known by markers", planned(dc.Sensor.poses())),
+        ("`measured`: expected configurations that one device", planned([tracker, found], measured=q[:2])),
+        ("NX,NY,NZ,D", lambda: dc.Sensor.heights([[0.0, 0.0, 1.0]])),
+        ("with a direction", lambda: dc.Sensor.heights([[0.0, 0.0, 0.0, 1.0]])),
+        ("`std` of a sensor", lambda: dc.Sensor.positions(-1.0)),
+    )
+
+
+# --- images of a board ------------------------------------------------------------------------------------------------
+
+
+FEWEST = 4
+
+
+def cameras(kind: Kind) -> list[Any]:
+    return [one for one in sensor_of(kind.model) if isinstance(one, BoardImages)]
+
+
+@cache
+def drawn(kind: str) -> Tensor:
+    """Half of them where a camera sees the board, half anywhere."""
+    model, q = kind_named(kind).model, []
+    for one in cameras(kind_named(kind)):
+        q.append(candidates(model.robot, 40, **one.reached(model.geometry.base)))
+    return torch.cat([*q, candidates(model.robot, 40)])
+
+
+def corners_in_truth(q: Tensor, arm: Any, *, on_tool: bool) -> Tensor:
+    """(N,) corners of the real board that the real camera sees from its front."""
+    poses = poses_from_marks(arm.arm.true_points(q), LEVER)
+    boards = inverse_poses(poses) if on_tool else poses
+    from_above = inverse_poses(boards)[:, 2, 3] > 0
+    return (~seen_corners(boards, 0.0, camera=arm.camera)[..., 3].isnan()).sum(1) * from_above * (boards[:, 2, 3] > 0)
+
+
+SEEN: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "images of a board": (lambda second: camera_arm(60), ("camera",)),
+    "two cameras": (lambda second: fixed_camera_arm(70, second=second), ("left", "right")),
+    "two cameras on the tool": (lambda second: camera_arm(70, second=second), ("left", "right")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEEN)
+def test_the_camera_sees_the_board_in_the_poses_that_are_planned_for_it(name: str) -> None:
+    model, (arm_of, names) = kind_named(name).model, SEEN[name]
+    arms = {own: arm_of(own == "right") for own in names}
+    plan = dc.plan(model, drawn(name), 12)
+    for own, q in zip(plan.devices or 12 * names, plan.q, strict=True):
+        assert int(corners_in_truth(q[None], arms[own], on_tool=name != "two cameras")) >= FEWEST
+    last = cameras(kind_named(name))[-1]
+    alone = dc.plan(model, drawn(name), 6, sensor=last)
+    assert int(corners_in_truth(alone.q, arms[last.name or names[-1]], on_tool=name != "two cameras").min()) >= FEWEST
+
+
+@pytest.mark.slow
+def test_an_image_tells_what_its_pose_shows() -> None:
+    """Against poses and effects that are found from corners."""
+    arm = camera_arm(60)
+    corners = arm.shown(0.1)[1]
+    whole = (~corners[..., 3].isnan()).all(1)
+    found = sighted(Images(corners[whole, :, :3], corners[whole, :, 3:], WIDTH, HEIGHT), None, BOARD_PRIOR)
+    covariance, effects = expected_errors(found.camera, found.poses)
+    ratio = covariance.diagonal(dim1=1, dim2=2) / found.covariance.diagonal(dim1=1, dim2=2)
+    assert 0.6 < float(ratio.median()) < 1.6  # an image's noise is its own
+    assert_close(effects @ found.camera.root, found.shared, rtol=0, atol=0.02 * float(found.shared.abs().max()))
+
+
+@pytest.mark.slow
+def test_views() -> None:
+    """Too near, too far, too flat, from behind, behind the camera, outside of the image, and folded back into it."""
+    points, pixels = camera_arm(60).shown(0.1)[1].split([3, 2], 2)
+    images = Images(points, pixels, WIDTH, HEIGHT)
+    view = sighted(images, None, BOARD_PRIOR).camera.view
+    assert (len(view.points), view.fewest) == (35, int(images.seen.sum(1).min()))
+    camera = replace(true_camera(), view=replace(view, near=0.3, far=0.6, facing=-0.4))
+    ahead = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    ahead[2, 3] = 0.4
+    places = [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]  # shift, and turn about x
+    places += [(0.0, 0.0, z, 0.0) for z in (-0.12, 0.25, -0.8)] + [(0.3, 0.0, 0.0, 0.0)]
+    shift, turn = torch.tensor([*places, (0.0, 0.0, 0.0, 1.3), (0.0, 0.0, 0.0, 3.1)], dtype=torch.float64).split(
+        [3, 1], 1
+    )
+    poses = ahead.repeat(len(shift), 1, 1)
+    poses[:, :3, :3] = rotation(torch.nn.functional.pad(turn, (0, 2))) @ ahead[:3, :3]
+    poses[:, :3, 3] += shift
+    assert sees(camera, poses).tolist() == [True] * 2 + [False] * 6
+    folding = replace(camera, unknowns=camera.unknowns.clone(), view=replace(camera.view, far=9.0, facing=-0.1))  # pyright: ignore
+    folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
+    ahead[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
+    assert not bool(shown(folding, ahead[None]).any())

@@ -12,7 +12,7 @@ from kind_bank import kind_named
 from process_bank import case
 from product_bank import Case, noise_blocks
 from scipy.stats import chi2
-from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from tangent_bank import SETTINGS, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -49,13 +49,13 @@ def test_the_unit_of_length_does_not_matter() -> None:
 
     geometry = setting.nominal.geometry
     large = replace(data, nominal=Grown(geometry), theta=data.theta[: geometry.size], x=data.x * big)
-    grown = defaults(large, 10 * noise, prior)
-    assert_close(grown.coupled_lengthscale, setting.scales.coupled_lengthscale * big, rtol=1e-6, atol=0)
-    assert_close(grown.transmission_lengthscale, setting.scales.transmission_lengthscale * big, rtol=1e-6, atol=0)
-    assert_close(grown.task_lengthscale, 10 * setting.scales.task_lengthscale, rtol=1e-6, atol=0)
-    assert_close(grown.sensor_noise, 10 * setting.scales.sensor_noise, rtol=1e-6, atol=0)
+    grown, lengths = (
+        defaults(large, 10 * noise, prior),
+        dict.fromkeys(("coupled_lengthscale", "transmission_lengthscale"), big),
+    )
+    for name, factor in (lengths | {"task_lengthscale": 10, "sensor_noise": 10, "task_amplitude": 10}).items():
+        assert_close(getattr(grown, name), factor * getattr(setting.scales, name), rtol=1e-6, atol=0)
     assert_close(grown.rotation_noise, setting.scales.rotation_noise, rtol=1e-6, atol=0)
-    assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude, rtol=1e-6, atol=0)
     assert bool((grown.joint_noise > 0).all())
 
 
@@ -81,7 +81,9 @@ def log_density(matrix: Tensor, target: Tensor) -> float:
     return float(-0.5 * (square + size + len(target) * np.log(2 * np.pi)))
 
 
-def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
+@pytest.mark.parametrize("name", SETTINGS)
+def test_posterior_is_likelihood_times_prior(name: str) -> None:
+    setting = built(name)
     scales, data = shaken(setting.scales, 2), weighted(setting, 2)
     nominal, theta, x = data.nominal.changed(rigid=True) if data.basis is not None else data.nominal, data.theta, data.x
     total = tangent_covariance(scales, nominal, theta, x)

@@ -1,121 +1,88 @@
-"""Calibration with a ball in sockets: accuracy, laws of the gauge, held-out places, and rows that cannot be right."""
+"""A ball in sockets, alone and beside other kinds: accuracy, laws of the gauge, devices, rows that cannot be right."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named
-from product_bank import with_usual_scales
-from reading_bank import scales
+from kind_bank import kind_named, rigid_rms
+from reading_bank import DISTANCES, readings, scales
+from reading_bank import scales as usual
 from simulated_sockets import SocketRows, rest_in_sockets
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import covariance
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
-from diffeo_calib.calibration.identification.registration import register_sockets
+from diffeo_calib.calibration.identification.identification import (
+    KindRows,
+    Rows,
+    estimated,
+    held_parameters,
+)
+from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices
-from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
-from diffeo_calib.calibration.scales.selection import Selection, defaults
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
+from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.readings import SocketReadings
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.sensors.coordinates import fitting_devices
 
-DISTANCES = {("0", "1"): 0.05}
-
-
-@pytest.fixture(scope="module")
-def arm() -> SimulatedArm:
-    return SimulatedArm(seed=0)
+KIND = kind_named("ball in sockets")
+ARM, DATA = KIND.robot, KIND.data
 
 
-@pytest.fixture(scope="module")
-def rows(arm: SimulatedArm) -> SocketRows:
-    return rest_in_sockets(arm, seed=0, rows=12)
-
-
-@pytest.fixture(scope="module")
-def data(arm: SimulatedArm, rows: SocketRows) -> SocketReadings:
-    names = arm.nominal.joint_names
-    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
-
-
-@pytest.fixture(scope="module")
-def result(arm: SimulatedArm, data: SocketReadings) -> Any:
-    return with_usual_scales(arm.nominal, data)
-
-
-def aligned(points: Tensor, truth: Tensor) -> Tensor:
-    """What remains of the errors of points (N, 3) after the best rigid motion."""
-    T = rigid_fit(points, truth)
-    return points @ T[:3, :3].mT + T[:3, 3] - truth
-
-
-def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
-    found = result.sockets
+def test_the_sockets_are_where_they_are() -> None:
+    found, rows = KIND.result.sockets, rest_in_sockets(SimulatedArm(seed=0), seed=3, places=5, rows=6)
     truth = torch.stack([rows.positions[name] for name in found.names])
-    errors = aligned(found.positions, truth)
-    assert float(errors.norm(dim=1).square().mean().sqrt()) < 6e-5
+    T = rigid_fit(found.positions, truth)
+    errors = found.positions @ T[:3, :3].mT + T[:3, 3] - truth
+    assert float(errors.norm(dim=1).square().mean().sqrt()) < 9e-5
     assert 0.1 < float((errors / found.devices.deviations).square().mean()) < 2.5
-    first, second = found.positions[0], found.positions[1]
+    first, second = found.positions[:2]
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
 
 
 @pytest.fixture(scope="module")
-def placed(arm: SimulatedArm, data: SocketReadings) -> Placed:
-    return place(arm.nominal, data, silent)
+def placed() -> Placed:
+    return place(ARM, DATA, silent)
 
 
-def test_places_left_out_by_leaving_them_out(data: SocketReadings, placed: Placed) -> None:
-    """Closed form against a regression without the rows of the place."""
-    tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
-    scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
-    chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    socket, own = devices.device, devices.sockets.place[devices.device] == 2
-    rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
-    mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
-    gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
-    predicted = (
-        torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]] - tangent.target[gone]
-    )
-    torch.testing.assert_close(devices.left_out(chosen)[own], predicted, rtol=0, atol=1e-9)
-
-
-def test_deviations_grow_where_places_contradict_each_other(data: SocketReadings, placed: Placed) -> None:
+def test_deviations_grow_where_places_contradict_each_other(placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
-    K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
-    for number in range(6):
-        own = (data.places == number).repeat_interleave(3)
+    K, r, total, count = covariance(tangent, scales), tangent.target.flatten(), 0.0, int(DATA.places.max()) + 1
+    for number in range(count):
+        own = (DATA.places == number).repeat_interleave(3)
         gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
         errors, spread = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
         total += float(errors @ torch.linalg.solve(spread, errors))
-    ratio = total / (3 * len(data) - 3 * 12)
+    ratio = total / (3 * len(DATA) - 3 * 2 * count)
     assert ratio > 1.5, "scales that are too small"
-    groups = data.groups()
-    factor = inflation_by_places(tangent, scales, data.places, data.device, groups)
-    assert factor == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
-    wide = defaults(tangent, 10 * found.noise, found.prior)
-    assert inflation_by_places(tangent, wide, data.places, data.device, groups) == region_factor(6, 3)
+
+    def factor(scales: dc.Hyperparameters) -> float:
+        return inflation_by_places(tangent, scales, DATA.places, DATA.device, DATA.groups())
+
+    assert factor(scales) == pytest.approx(ratio * region_factor(count, 3), rel=1e-5)
+    assert factor(defaults(tangent, 10 * found.noise, found.prior)) == region_factor(count, 3)
 
 
-def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: SocketRows) -> None:
-    names = arm.nominal.joint_names
-    wrong = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.051}, distance_std=3e-5)
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"differ") as caught:
-        result = dc.calibrate(arm.nominal, wrong, hyperparameters=scales())
-    (text,) = [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+def test_a_size_that_is_not_the_robots_is_warned_about() -> None:
+    wrong = with_attributes(DATA, distances=tuple((*own[:-1], 0.051) for own in DATA.distances), distance_std=3e-5)
+    result, texts = warned(dc.calibrate, ARM, wrong, hyperparameters=scales())
+    (text,) = [one for one in texts if "seems to differ" in one]
     assert re.match(r"the (distance of .*\(51.00 mm\)|size of the robot) seems to differ by \+", text), text
     assert result.lengths[0].value == pytest.approx(0.02, abs=0.006)
     assert result.expected.workspace > 3e-3
@@ -143,7 +110,8 @@ def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: obj
 
 def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
     bare: Any = {"distances": None, "distance_std": None}
-    ball = kind_named("ball in sockets")
+    tracked, resting = MIXED.source.rows.parts
+    few = dc.Measurements.joined([tracked.rows([0, 1]), resting])
 
     def staged(data: SocketReadings) -> Callable[[], object]:
         return lambda: place(plain.nominal, data, silent)
@@ -153,11 +121,12 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
             r"sockets: expected at least 2 rows with each name, got '2/1' in 1 row",
             staged(table(some).rows(slice(0, 31))),
         ),
+        ("9 unknowns .* expected at least 3 poses", staged(few)),
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
         ("rows with sockets: expected no sessions", lambda: table(some).with_sessions(["a"] * 18 + ["b"] * 18)),
-        ("expected 'flange', got 'hand'", lambda: dc.evaluate(ball.model, ball.new.with_tips(["hand"]))),
+        ("expected 'flange', got 'hand'", lambda: dc.evaluate(KIND.model, KIND.new.with_tips(["hand"]))),
         ("expected names alone", lambda: dc.Readings.of("socket", some.q, 0.0, some.names)),
         ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
         *(
@@ -216,10 +185,6 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
-    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 2 rows repeat an earlier row"):
-        dc.Measurements.from_sockets(some.q[[0, 0]], ["a", "b"])
-    with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
-        table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
     known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7})
     assert known.lengths == [(0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7)]
@@ -233,3 +198,92 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
     with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
         data.folds(4)
+
+
+MIXED = kind_named("mixture")
+"""Marker 0 is the ball; the tracker sees marker 1."""
+
+
+def rms(errors: Tensor) -> float:
+    return float(errors.square().sum(-1).mean().sqrt())
+
+
+def test_several_set_ups_of_the_device() -> None:
+    """Rows in sockets belong to no set-up, and the places of the robot to all."""
+    T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
+    device, resting = MIXED.source.rows.parts
+    second, truth = torch.arange(len(device)) % 3 == 1, MIXED.source.truth
+    points = torch.where(second[:, None, None], device.points @ T[:3, :3].mT + T[:3, 3], device.points)
+    moved = with_attributes(device, points=points).with_sessions(["ab"[int(flag)] for flag in second])
+    found = dc.calibrate(MIXED.robot, dc.Measurements.joined([moved, resting]), hyperparameters=MIXED.scales)
+    torch.testing.assert_close(found.sessions.transforms[1], T, rtol=0, atol=5e-4)
+    q = MIXED.q(100)
+    assert rms(found.model(q) - truth(q)) < 1.5 * rms(MIXED.model(q) - truth(q))
+
+
+@pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
+def test_rows_of_another_robot() -> None:
+    bend = torch.zeros(6, dtype=torch.float64)
+    bend[4] = 0.05
+    tracked, resting = MIXED.source.rows.parts
+    other = with_attributes(resting, q=resting.q + bend, distances=())
+    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
+        place(MIXED.robot, dc.Measurements.joined([tracked, other]), silent)
+
+
+def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
+    """Every kind of rows has a noise of its own: 2 mm of distances, 0.02 mm of positions of the same marker."""
+    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=2e-5)
+    q, points = arm.measure(30)
+    data, test = readings(arm, "distance", 120, noise=2e-3), arm.sample(200, 9)
+    start = register(arm.nominal, q, points).geometry
+    parts = KindRows.positions(q, points), KindRows.read(data, fitting_devices(data, start.points(data.q)))
+    found = [estimated(Rows(start, some), held_parameters(start)) for some in (parts[:1], parts)]
+    alone, both = (rms(one.geometry.points(test) - arm.true_points(test)) for one in found)
+    assert both < 1.1 * alone
+    for weights in found[1].weights:
+        assert 0.5 < float(weights.median()) < 1.5
+
+
+# --- tables of several kinds ------------------------------------------------------------------------------------------
+
+PLAIN = SimulatedArm(3)
+NAMES = PLAIN.nominal.joint_names
+NOISE = 2e-5
+
+
+def read(kind: str, count: int) -> dc.Readings:
+    return readings(PLAIN, kind, count, noise=NOISE)
+
+
+def fit_of(data: dc.Observations) -> Any:
+    """With the noise of each kind given."""
+    other = torch.full((len(data.parts) - 1,), NOISE, dtype=torch.float64)
+    return dc.calibrate(PLAIN.nominal, data, hyperparameters=replace(usual(), other_noise=other))  # type: ignore[arg-type]
+
+
+def test_sockets_and_distances_alone() -> None:
+    """As good as the model says; errors of every kind are judged by themselves, and better than by geometry."""
+    rows = rest_in_sockets(PLAIN, seed=3, places=4, rows=5)
+    sockets = dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances=DISTANCES, distance_std=1e-5)
+    data: Any = dc.Observations.joined([sockets, read("distance", 36)])
+    result, q = fit_of(data), PLAIN.sample(200, 9)
+    error = rigid_rms(result.model(q).detach(), PLAIN.true_points(q))
+    assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
+    assert result.fit.converged
+    kinds = result.errors(data)
+    assert len(kinds) == 2
+    for one in kinds.values():
+        assert one["calibrated"].rms < one["geometric"].rms
+
+
+@pytest.mark.slow
+def test_the_order_of_the_rows_does_not_matter() -> None:
+    tracked = dc.Measurements(*PLAIN.measure(20, seed=4), NAMES)
+    data: Any = dc.Observations.joined([tracked, read("distance", 24), read("height", 24)])
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
+    order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
+    mixed = data.rows(order.tolist())
+    assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
+    one, other = (fit_of(rows).model(PLAIN.sample(20, 9)) for rows in (data, mixed))
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-6)

@@ -19,10 +19,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli import commanded_poses
+from diffeo_calib.cli.commands import init as commanded_poses
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -17,7 +17,7 @@ from kind_bank import UNITS, kind_named
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.cli.printed import registration_lines
+from diffeo_calib.cli.models import registration_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices
 from diffeo_calib.robots.se3 import twist_transform

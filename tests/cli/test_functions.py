@@ -14,8 +14,8 @@ from documentation_bank import write_commanded_tables
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv import joints
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv import columns as joints
+from diffeo_calib.measurements.csv.columns import PoseColumns
 
 MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
 

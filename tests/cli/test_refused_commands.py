@@ -128,7 +128,7 @@ def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, co
 
 
 def test_outputs_are_checked_before_the_fit(small_site: Site, command: Command, tmp_path: Path) -> None:
-    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.robot_of", lambda *_: pytest.fail("the work has begun"))
+    command.monkeypatch.setattr("diffeo_calib.cli.models.robot_of", lambda *_: pytest.fail("the work has begun"))
     (tmp_path / "here.png").mkdir()
     for option in ("-o", "--report"):
         for place, message in (("none/file.png", "No such file or directory"), ("here.png", "Is a directory")):

@@ -12,8 +12,8 @@ from command_bank import TABLE, Command, Site
 from rich.console import Console
 
 import diffeo_calib as dc
+from diffeo_calib.cli.models import ErrorTable
 from diffeo_calib.cli.options import Rows, Units
-from diffeo_calib.cli.printed import ErrorTable
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table, table_format
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.sensors.errors import Evaluation

@@ -1,7 +1,6 @@
 """The energy (16), its certificates, functionals of k1 as measurements, and the input that problems refuse."""
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,10 @@ import torch
 from fit_bank import Offset, deformed, noise_blocks
 from math_bank import K_V, K_W, circle, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from section_5 import section_5
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, ReadPoints
@@ -110,33 +109,19 @@ def test_the_tangent_model_is_written_out_and_the_first_gauss_newton_iterate(pro
         torch.testing.assert_close(actual, wanted, rtol=1e-8, atol=1e-9)
 
 
-def test_problem_takes_arrays_and_lists() -> None:
-    x, problem = elastic_rr.grid(4), rr_problem(4)
-    kernels = {"joint_kernel": K_V, "task_kernel": K_W}
-    for kind in (np.asarray, Tensor.tolist, lambda t: t.clone().requires_grad_()):
-        live = isinstance(kind(x), Tensor)
-        with pytest.warns(dc.DiffeoCalibWarning, match="back to `x`, `y`") if live else nullcontext():
-            other = Problem(elastic_rr.nominal, kind(x), kind(problem.y), noise=np.float64(0.01), **kernels)
-        torch.testing.assert_close(other.x, problem.x, rtol=0, atol=0)
-        torch.testing.assert_close(other.noise.covariance, problem.noise.covariance, rtol=0, atol=0)
-        assert not other.x.requires_grad
-        assert not other.y.requires_grad
-
-
 X = uniform(5, 2, seed=3)
 Y = elastic_rr.real(X)
 
 
 def make(**changes: object) -> Problem:
-    arguments: dict[str, object] = {
-        "nominal": elastic_rr.nominal,
-        "x": X,
-        "y": Y,
-        "joint_kernel": K_V,
-        "task_kernel": K_W,
-        "noise": 0.01,
-    }
-    return Problem(**(arguments | changes))  # pyright: ignore[reportArgumentType]
+    given = {"nominal": elastic_rr.nominal, "x": X, "y": Y, "joint_kernel": K_V, "task_kernel": K_W, "noise": 0.01}
+    return Problem(**(given | changes))  # pyright: ignore[reportArgumentType]
+
+
+def test_gradients_do_not_lead_back_to_the_data() -> None:
+    """Arrays and lists: tests/kinematics/test_data_frames.py."""
+    with pytest.warns(dc.DiffeoCalibWarning, match="back to `x`"):
+        assert not make(x=X.clone().requires_grad_()).x.requires_grad
 
 
 def with_nan(t: Tensor) -> Tensor:
@@ -145,79 +130,53 @@ def with_nan(t: Tensor) -> Tensor:
     return t
 
 
-def asymmetric() -> Tensor:
+def wrong_blocks(row: int, skew: float = 0.0) -> Tensor:
+    """One of which is not symmetric, or negative."""
     covariance = noise_blocks(5, 2)
-    covariance[3, 0, 1] += 1e-6
+    covariance[row] *= 1.0 if skew else -1.0
+    covariance[row, 0, 1] += skew
     return covariance
 
 
-def indefinite() -> Tensor:
-    covariance = noise_blocks(5, 2)
-    covariance[2] = -covariance[2]
-    return covariance
+BAD: tuple[tuple[str, dict[str, object]], ...] = (
+    (r"`x` has 1 value\(s\) that are not finite, the first at index \[3, 1\]", {"x": with_nan(X)}),
+    ("`x` is empty", {"x": X[:0], "y": Y[:0]}),
+    (r"`x` has the wrong shape: expected \(N, n\), got \(5,\)", {"x": X[:, 0]}),
+    (r"`y` has the wrong shape: expected \(5, m\), got \(4, 2\); pass one measured point", {"y": Y[:4]}),
+    ("`markers`: expected a divisor of the 2 columns of `y`, got 3", {"markers": 3}),
+    ("`joint_kernel`|length scales|number of length scales", {"joint_kernel": dc.VonMises([1.0, 1.0, 1.0])}),
+    (r"`joint_kernel`.* on 2 coordinates", {"joint_kernel": dc.PerJoint([1.0] * 3, [1.0] * 3, circle(3))}),
+    ("`task_kernel`: expected a kernel on 2 coordinates", {"task_kernel": dc.Gaussian(1.0, [1.0] * 3)}),
+    ("`noise`: expected positive", {"noise": -0.1}),
+    ("`joint_kernel`: expected a kernel such as .*got None", {"joint_kernel": None}),
+    ("`noise`: expected sigma in m or one covariance block per row, got None", {"noise": None}),
+    ("`noise` has 1 value", {"noise": float("nan")}),
+    (r"`noise` has the wrong shape: expected \(5, 2, 2\)", {"noise": noise_blocks(1, 2)}),
+    ("`noise`: expected symmetric positive definite.*first at row 3", {"noise": wrong_blocks(3, 1e-6)}),
+    ("`noise`: expected symmetric.*first at row 2", {"noise": wrong_blocks(2)}),
+    ("`new_noise` cannot be read as numbers", {"new_noise": "x"}),
+    (r"`new_noise` has the wrong shape: expected \(2, 2\)", {"new_noise": torch.eye(5)}),
+    ("`new_noise`: expected a symmetric positive", {"new_noise": [[1.0, 0.5], [0.0, 1.0]]}),
+    ("`new_noise`: expected a symmetric positive", {"new_noise": [[1.0, 0.0], [0.0, -1.0]]}),
+    ("`nominal`: expected a function", {"nominal": 3}),
+    (r"`nominal\(x\)` has the wrong shape: expected \(5, 2\), got \(5, 4\)", {"nominal": planar_two_markers}),
+    (r"`nominal\(x\)` has \d+ value\(s\) that are not finite", {"nominal": lambda x: x.sqrt()}),
+    ("`prior_variance`", {"nominal": Offset()}),
+    ("`prior_variance`: expected positive numbers", {"nominal": Offset(), "prior_variance": [1.0, -1.0]}),
+)
 
 
-BAD: dict[str, tuple[dict[str, object], str]] = {
-    "NaN in x": ({"x": with_nan(X)}, r"`x` has 1 value\(s\) that are not finite, the first at index \[3, 1\]"),
-    "no rows": ({"x": X[:0], "y": Y[:0]}, "`x` is empty"),
-    "flat x": ({"x": X[:, 0]}, r"`x` has the wrong shape: expected \(N, n\), got \(5,\)"),
-    "fewer y": ({"y": Y[:4]}, r"`y` has the wrong shape: expected \(5, m\), got \(4, 2\); pass one measured point"),
-    "words": ({"x": [["a", "b"]] * 5}, "`x` cannot be read as numbers"),
-    "markers do not divide": ({"markers": 3}, "`markers`: expected a divisor of the 2 columns of `y`, got 3"),
-    "joint kernel of 3 joints": (
-        {"joint_kernel": dc.VonMises([1.0, 1.0, 1.0])},
-        "`joint_kernel`|length scales|number of length scales",
-    ),
-    "joint kernel on another space": (
-        {"joint_kernel": dc.PerJoint([1.0] * 3, [1.0] * 3, circle(3))},
-        "`joint_kernel`: expected a kernel on 2 coordinates",
-    ),
-    "task kernel of 3 coordinates": (
-        {"task_kernel": dc.Gaussian(1.0, [1.0] * 3)},
-        "`task_kernel`: expected a kernel on 2 coordinates",
-    ),
-    "negative noise": ({"noise": -0.1}, "`noise`: expected positive"),
-    "no joint kernel": ({"joint_kernel": None}, "`joint_kernel`: expected a kernel such as .*got None"),
-    "complex numbers": ({"y": torch.ones(5, 2, dtype=torch.complex128)}, "`y` cannot be read as numbers .complex"),
-    "no noise": ({"noise": None}, "`noise`: expected sigma in m or one covariance block per row, got None"),
-    "NaN noise": ({"noise": float("nan")}, "`noise` has 1 value"),
-    "noise of one row": ({"noise": noise_blocks(1, 2)}, r"`noise` has the wrong shape: expected \(5, 2, 2\)"),
-    "asymmetric noise": ({"noise": asymmetric()}, "`noise`: expected symmetric positive definite.*first at row 3"),
-    "indefinite noise": ({"noise": indefinite()}, "`noise`: expected symmetric.*first at row 2"),
-    "words as new noise": ({"new_noise": "x"}, "`new_noise` cannot be read as numbers"),
-    "new noise of 5 coordinates": ({"new_noise": torch.eye(5)}, r"`new_noise` has the wrong shape: expected \(2, 2\)"),
-    "asymmetric new noise": ({"new_noise": [[1.0, 0.5], [0.0, 1.0]]}, "`new_noise`: expected a symmetric positive"),
-    "indefinite new noise": ({"new_noise": [[1.0, 0.0], [0.0, -1.0]]}, "`new_noise`: expected a symmetric positive"),
-    "nominal is no function": ({"nominal": 3}, "`nominal`: expected a function"),
-    "nominal of another shape": (
-        {"nominal": planar_two_markers},
-        r"`nominal\(x\)` has the wrong shape: expected \(5, 2\), got \(5, 4\)",
-    ),
-    "nominal not defined": ({"nominal": lambda x: x.sqrt()}, r"`nominal\(x\)` has \d+ value\(s\) that are not finite"),
-    "missing prior": ({"nominal": Offset()}, "`prior_variance`"),
-    "negative prior": (
-        {"nominal": Offset(), "prior_variance": [1.0, -1.0]},
-        "`prior_variance`: expected positive numbers",
-    ),
-}
-
-
-@pytest.mark.parametrize(("changes", "message"), BAD.values(), ids=BAD.keys())
-def test_bad_input_is_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make(**changes)
-
-
-NOT_DIFFERENTIABLE: dict[str, Callable[[Tensor], Tensor]] = {
-    "detached": lambda x: elastic_rr.nominal(x.detach()),
-    "numpy": lambda x: torch.as_tensor(np.cos(x.numpy())),
-}
-
-
-@pytest.mark.parametrize("nominal", NOT_DIFFERENTIABLE.values(), ids=NOT_DIFFERENTIABLE.keys())
-def test_a_nominal_map_without_derivative_is_refused(nominal: Callable[[Tensor], Tensor]) -> None:
-    with pytest.raises(InputError, match="not differentiable by torch"):
-        tangent(make(nominal=nominal))
+def test_bad_input_is_refused() -> None:
+    observe, apart, x = observations()["distance"], "not differentiable by torch", configurations()
+    detached, by_numpy = lambda x: elastic_rr.nominal(x.detach()), lambda x: torch.as_tensor(np.cos(x.numpy()))
+    refused(
+        *((message, partial(make, **changes)) for message, changes in BAD),
+        (apart, lambda: tangent(make(nominal=detached))),
+        (apart, lambda: tangent(make(nominal=by_numpy))),
+        (r"`y`.*\(30, 1\)", lambda: make(x=x, y=x, observe=observe)),
+        ("Observation", lambda: make(x=x, y=x[:, :1], observe=len)),
+        ("Eulerian", lambda: dc.fit(problem_of(observe), formulation="eulerian")),
+    )
 
 
 def test_a_nominal_map_may_ignore_a_joint() -> None:
@@ -312,15 +271,3 @@ def _gradient(problem: Problem, found: dc.Fit | None) -> Tensor:
     at = (problem.zero() if found is None else found.momenta).flatten().clone().requires_grad_()
     total = problem.energy(problem.deform(problem.zero().unflatten(at), dc.RK8(2))).total
     return torch.autograd.grad(total, at)[0]
-
-
-def test_what_problems_refuse() -> None:
-    observe = observations()["distance"]
-    kernels: dict[str, Any] = {"joint_kernel": K_V, "task_kernel": K_W, "noise": 1e-3}
-    x = configurations()
-    with pytest.raises(InputError, match=r"`y`.*\(30, 1\)"):
-        Problem(elastic_rr.nominal, x, elastic_rr.real(x), observe=observe, **kernels)
-    with pytest.raises(InputError, match="Observation"):
-        Problem(elastic_rr.nominal, x, x[:, :1], observe=len, **kernels)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="Eulerian"):
-        dc.fit(problem_of(observe), formulation="eulerian")

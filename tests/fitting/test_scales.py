@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 import torch
+from fit_bank import Offset
 from math_bank import normal, uniform
 from table_bank import refused
 from torch import Tensor
@@ -13,6 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.fitting import scales
 from diffeo_calib.fitting.scales import SPREAD
 from diffeo_calib.maps.noise import Noise, without_hidden
+from diffeo_calib.maps.observation import ReadPoints
 from diffeo_calib.robots import elastic_rr
 
 SIGMA, ROWS = 0.01, 60
@@ -124,4 +126,43 @@ def test_what_is_not_chosen_stays_and_what_is_refused() -> None:
         ("`iterations`", lambda: dc.choose_scales(arm(), iterations=0)),
         ("expected all data as control points, got 5 controls", lambda: dc.choose_scales(arm().with_controls(X[:5]))),
         ("raise `noise`", lambda: dc.choose_scales(exact)),
+    )
+
+
+@pytest.mark.parametrize("measured", ["positions", "distances"])
+def test_gradients_of_a_fit_are_those_of_other_fits(measured: str) -> None:
+    """By y, the prior, the noise and every scale, against central differences of losses after new fits."""
+    x, new = X[:12], uniform(5, 2, seed=8)
+    observe = (
+        None
+        if measured == "positions"
+        else ReadPoints(lambda a, p: (p - a).norm()[None], 2.0 + uniform(12, 2, seed=9), 2)
+    )
+    points = elastic_rr.real(x) + 0.1
+    kernels = {"joint_kernel": dc.Gaussian(1.0, variance=0.02), "task_kernel": dc.Gaussian((0.7, 0.9), variance=0.01)}
+    y = points if observe is None else observe.value(points)
+    problem = dc.Problem(Offset(), x, y, noise=0.02, prior_variance=torch.full((2,), 0.01), observe=observe, **kernels)
+    solver, steps = dc.GaussNewton(tolerance=1e-13, max_iterations=100), dc.RK4(2)
+    fit = dc.fit(problem, solver, steps)
+
+    def loss(values: Tensor) -> Tensor:
+        return (values - elastic_rr.real(new)).square().sum()
+
+    def other(changed: dc.Problem) -> float:
+        return float(loss(dc.fit(changed, solver, steps).model(new)))
+
+    found, small = fit.gradients(new, loss), 1e-4
+    by_scales = torch.cat([found.prior[None], found.noise[None], found.joint_kernel, found.task_kernel])
+    for gradient, changed in (
+        (by_scales, lambda step: scales.rescaled(problem, step)),
+        (found.y.flatten(), lambda step: problem._with(y=y + step.view_as(y))),
+    ):
+        steps_of = small * torch.eye(len(gradient), dtype=y.dtype)[:8]
+        differences = [(other(changed(step)) - other(changed(-step))) / (2 * small) for step in steps_of]
+        size = float(gradient.abs().max())
+        torch.testing.assert_close(gradient[:8], y.new_tensor(differences), rtol=1e-4, atol=1e-5 * size)
+    coarse = dc.fit(problem, integrator=steps, controls=5)
+    refused(
+        ("the fit: expected a converged one", lambda: coarse.gradients(new, loss)),
+        ("`loss`: expected a differentiable scalar", lambda: fit.gradients(new, lambda values: values)),
     )

@@ -1,16 +1,19 @@
-"""A deformation at its own controls, and rows of several kinds as one observation."""
+"""Rows of several kinds as one observation, and noise with shifts that rows share, against the explicit matrix."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from fit_bank import random_start
+from fit_bank import random_start, shared_noise
 from math_bank import normal, two_marker_problem, uniform
+from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps import linearisation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.noise import Noise, measured_coordinates, without_hidden
 from diffeo_calib.maps.nominal import SmoothMap
 from diffeo_calib.maps.observation import LinearFunctionals, Part, ReadPoints, Stacked
 from diffeo_calib.sensors.range import FixedPoints
@@ -79,3 +82,82 @@ def test_rows_are_those_of_the_whole(index: list[int]) -> None:
     assert len(some) == len(index)
     assert_close(some.value(Z[rows]), every.value(Z)[rows])
     assert_close(some.slope(Z[rows]), every.slope(Z)[rows])
+
+
+def explicit(noise: Noise) -> Tensor:
+    flat = noise.shared.flatten(0, 1)
+    return torch.block_diag(*noise.covariance) + flat @ flat.T
+
+
+def test_the_operations_are_those_of_the_explicit_matrix() -> None:
+    R, values = shared_noise(6, 3), normal(6, 3, seed=3)
+    matrix = explicit(R)
+    torch.testing.assert_close(R.solve(values).flatten(), torch.linalg.solve(matrix, values.flatten()))
+    torch.testing.assert_close(R.multiply(values[..., None]).flatten(), matrix @ values.flatten())
+    torch.testing.assert_close(R.add_to(torch.zeros_like(matrix)), matrix)
+    rows = torch.tensor([4, 1])
+    some = matrix.view(6, 3, 6, 3)[rows][:, :, rows].reshape(6, 6)
+    torch.testing.assert_close(explicit(R.rows(rows)), some)
+    torch.testing.assert_close(explicit(R.own), torch.block_diag(*R.covariance))
+
+
+def test_a_correlation_of_rounding_errors_is_symmetric() -> None:
+    """Products of Jacobians may leave 1e-19 and 1.00001e-19 beside variances of 1e-10."""
+    blocks = 1e-10 * torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+    blocks[1, 0, 1], blocks[1, 1, 0] = 1e-19, 1.00001e-19
+    assert torch.equal(Noise(blocks).covariance, blocks)
+    blocks[1, 1, 0] = 1e-12
+    with pytest.raises(InputError, match=r"`noise`.* at row 1"):
+        Noise(blocks)
+
+
+@pytest.mark.parametrize("reduced", [False, True])
+def test_a_map_knows_its_measurements(reduced: bool) -> None:
+    """The measurements that momenta imply are those of the fit, or, with few control points, lead to the same map."""
+    problem = two_marker_problem(uniform(15, 2, seed=3), shared_noise(15, 4))
+    solver, steps = dc.GaussNewton(tolerance=1e-12), dc.RK4(4)
+    controls = problem.x[::2] if reduced else None
+    fitted = dc.fit(problem, solver, steps, controls=controls)
+    implied = fitted.model.measured()
+    if not reduced:
+        torch.testing.assert_close(implied, problem.y, rtol=0.0, atol=1e-5)
+    problem.y = implied
+    again = dc.fit(problem, solver, steps, controls=controls, start=fitted.momenta)
+    new = uniform(20, 2, seed=8)
+    torch.testing.assert_close(again.model(new), fitted.model(new), rtol=0.0, atol=1e-4)
+
+
+def gaps(rows: int = 9, m: int = 6) -> tuple[Tensor, Tensor]:
+    """Random blocks, and which coordinates of them were measured."""
+    root = normal(rows, m, m, seed=5)
+    visible = (normal(rows, m // 3, seed=6) > -0.3).repeat_interleave(3, 1)
+    visible[0], visible[1, :3] = True, False
+    return root @ root.mT + torch.eye(m, dtype=torch.float64), visible
+
+
+def test_hidden_coordinates_carry_no_information() -> None:
+    """And stay hidden in another frame and with weights."""
+    blocks, visible = gaps()
+    hidden = without_hidden(blocks, visible)
+    noise, values = Noise(hidden), normal(*visible.shape, seed=7)
+    solved = noise.solve(values)
+    for row, seen in enumerate(visible):
+        expected = torch.linalg.solve(blocks[row][seen][:, seen], values[row, seen])
+        torch.testing.assert_close(solved[row, seen], expected, rtol=1e-9, atol=1e-12)
+        assert float(solved[row, ~seen].abs().sum()) < 1e-6
+    turn = torch.block_diag(*2 * [torch.linalg.qr(normal(3, 3, seed=8)).Q])
+    turned = turn @ hidden @ turn.mT
+    for same in (noise.visible, Noise(0.5 * (turned + turned.mT)).visible, measured_coordinates(turned / 2.5)):
+        assert same.tolist() == visible.tolist()  # 2.5: the largest weight of a row
+
+
+def test_mean_block_leaves_out_what_was_hidden() -> None:
+    blocks, visible = gaps()
+    mean = Noise(without_hidden(blocks, visible)).mean
+    for k in range(visible.shape[1]):
+        own = blocks[visible[:, k], k, k]
+        assert float(mean[k, k]) == pytest.approx(float(own.mean()), rel=1e-12)
+    assert float(torch.linalg.eigvalsh(mean)[0]) > 0
+    large = 1e12 * blocks  # the unit of a map that is no robot's
+    assert bool(Noise(large).visible.all())
+    torch.testing.assert_close(Noise(large).mean, large.mean(0))

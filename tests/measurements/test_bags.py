@@ -35,13 +35,10 @@ def bag() -> Bag:
 
 @dataclass
 class Recorder:
-    """Runs `record` on bags that it writes."""
-
     command: Command
     folder: Path
 
     def table(self, bag: Bag | Path, seen: str, *more: str) -> tuple[Any, list[dict[str, str]]]:
-        """What the command says, and the rows of its table."""
         path = bag.write(self.folder / f"bag{id(bag)}") if isinstance(bag, Bag) else bag
         done = self.command("record", path, seen, "-o", self.folder / "run.csv", *more)
         assert done.code == 0, done.err
@@ -116,11 +113,7 @@ def test_frames_are_chained(record: Recorder, bag: Bag, tmp_path: Path) -> None:
         assert "without rotations" in done.out
         stands = np.array([expected[np.abs(times - middle).argmin()] for middle in MIDDLES])
         np.testing.assert_allclose(numbers(table, "xyz"), stands, rtol=0, atol=1e-4)
-    for frames, words in (
-        ("", ["none of", "camera>ball", "world>lift"]),
-        (":cube", ["cube of"]),
-        (":camera", ["camera"]),
-    ):
+    for frames, words in (("", ["none of", "camera>ball", "world>lift"]), (":cube", ["cube of"]), (":camera", [])):
         record.refused(path, f"/tf{frames}", *words, "/tf:PARENT>CHILD")
 
 
@@ -133,17 +126,14 @@ def test_bags_of_ros_1_are_read_by_their_file(tmp_path: Path, record: Recorder) 
     times, q = motion(40)
     path = tmp_path / "one.bag"
     with rosbag1.Writer(path) as writer:
-        known = [
-            writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in zip((JOINTS, PLACES), kinds, strict=True)
-        ]
+        topics = zip((JOINTS, PLACES), kinds, strict=True)
+        known = [writer.add_connection(topic, kind, typestore=store) for topic, kind in topics]
         for k, time in enumerate(times):
             stamp = store.types["builtin_interfaces/msg/Time"](int(time), int(time % 1 * 1e9))
             header, nothing = store.types["std_msgs/msg/Header"](k, stamp, ""), np.zeros(0)
             at = store.types["geometry_msgs/msg/Point"](*place(q[k : k + 1])[0])
-            for own, kind, message in zip(
-                known, kinds, (state(header, NAMES, q[k], nothing, nothing), point(header, at)), strict=True
-            ):
+            both = state(header, NAMES, q[k], nothing, nothing), point(header, at)
+            for own, kind, message in zip(known, kinds, both, strict=True):
                 writer.write(own, int(1e9 * time), store.serialize_ros1(message, kind))
     np.testing.assert_allclose(numbers(record.table(path, PLACES)[1]), PLACES_RAD, rtol=0, atol=5e-4)
     for wrong in (tmp_path, path.rename(tmp_path / "one.rosbag")):
@@ -164,11 +154,8 @@ def test_images_of_stops_and_their_joints(bag: Bag, tmp_path: Path, record: Reco
 def test_raw_images_keep_their_pixels(bag: Bag, tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2")
     grey = PIXELS[..., :1]
-    for encoding, pixels, expected in (
-        ("bgr8", PIXELS, PIXELS),
-        ("rgb8", PIXELS, PIXELS[..., ::-1]),
-        ("mono8", grey, np.repeat(grey, 3, 2)),
-    ):
+    ways = ("bgr8", PIXELS, PIXELS), ("rgb8", PIXELS, PIXELS[..., ::-1]), ("mono8", grey, np.repeat(grey, 3, 2))
+    for encoding, pixels, expected in ways:
         bag.topics.pop(PICTURES, None)
         bag.images(MIDDLES, pixels, encoding)
         path = bag.write(tmp_path / encoding)

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,7 @@ JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
 PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")
 
 
-def joined(
-    folder: Path, joints: tuple[str, ...] = JOINTS, places: tuple[str, ...] = PLACES, by: str = "pose", **how: bool
-) -> HeldFile:
+def joined(folder: Path, joints: Any = JOINTS, places: Any = PLACES, by: str = "pose", **how: bool) -> HeldFile:
     for name, lines in (("joints", joints), ("places", places)):
         (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
     return joined_file(folder / "joints.csv", folder / "places.csv", by, **how)
@@ -58,7 +57,6 @@ def test_mistakes_name_both_files(tmp_path: Path) -> None:
 
 
 def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
-    """Each line of the shorter file has a partner, unless the other one has a gap there."""
     times = [0.0, 1.0, 2.0, 5.0, 6.0, 7.0]
     joints = ("t,a", *(f"{t},{k}" for k, t in enumerate(times)))
     places = ("t,x", "0.8,10", "3.4,11", "6.3,12")
@@ -74,12 +72,11 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert [(line, cells[1:]) for line, cells in read_cells(third, ",")[1]] == [(2, ["1", "10"]), (4, ["4", "12"])]
 
 
-@pytest.mark.parametrize(
-    ("places", "order"), [((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])]
-)
-def test_a_row_each_of_the_same_stops_by_two_clocks(
-    places: tuple[float, ...], order: list[int], tmp_path: Path
-) -> None:
+CLOCKS = ((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])
+
+
+@pytest.mark.parametrize(("places", "order"), CLOCKS)
+def test_the_same_stops_by_two_clocks(places: tuple[float, ...], order: list[int], tmp_path: Path) -> None:
     """Pauses that agree tell the offset; else the times are compared as they are."""
     files = ("t,a", "0,1", "3,2", "11,3"), ("t,x", *(f"{t},{k}" for k, t in enumerate(places)))
     if not order:  # pauses of other stops
@@ -101,7 +98,6 @@ def angle(times: np.ndarray) -> np.ndarray:
 
 
 def recordings(seed: int = 1) -> tuple[Recording, Recording]:
-    """Joints 100 times, places 130 times a second by a clock that is behind."""
     random, last = np.random.default_rng(seed), STOPS * (STAND_S + MOVE_S)
     joints, seen = np.arange(0, last, 0.01), np.arange(0, last, 1 / 130)
     noisy = place(angle(seen)) + NOISE_M * random.standard_normal((len(seen), 3))
@@ -125,12 +121,7 @@ def test_recordings_with_clocks_of_their_own(offset: float, rate: float, tmp_pat
     assert abs(float(words[1]) - offset) < 0.03
 
 
-def test_the_noise_of_a_recording_is_that_of_its_values() -> None:
-    values = 3.0 + 0.2 * np.random.default_rng(0).normal(size=(20_000, 2))
-    assert Recording(np.arange(20_000.0), values).noise == pytest.approx(0.2, rel=0.03)
-
-
-def test_stops_and_the_offset_are_found() -> None:
+def test_stops_the_offset_noise_and_images_are_found() -> None:
     found, offset = stops(*recordings())
     assert offset == pytest.approx(OFFSET_S, abs=0.03)
     assert len(found) == len(stops(*recordings(), offset=OFFSET_S)[0]) == STOPS
@@ -140,6 +131,15 @@ def test_stops_and_the_offset_are_found() -> None:
         np.testing.assert_allclose(one.seen, place(one.joints[None])[0], rtol=0, atol=1e-4)
         assert np.all((one.deviations > 0.6 * NOISE_M) & (one.deviations < 1.6 * NOISE_M))
         assert one.count > 100
+    joints, _ = recordings()
+    middles = np.arange(STOPS) * (STAND_S + MOVE_S) + 0.5 * STAND_S
+    times = np.concatenate([middles[1:] + 0.1, middles[1:] - 0.2, middles + 0.5 * (STAND_S + MOVE_S), [0.02]])
+    found, without = pictured(joints, times - 3.0, offset=3.0)
+    assert [time for _, time in found] == pytest.approx(list(middles[1:] + 0.1 - 3.0))
+    assert without == 1
+    np.testing.assert_allclose([q for q, _ in found], angle(middles[1:]), rtol=0, atol=5e-4)
+    values = 3.0 + 0.2 * np.random.default_rng(0).normal(size=(20_000, 2))
+    assert Recording(np.arange(20_000.0), values).noise == pytest.approx(0.2, rel=0.03)
 
 
 def test_recordings_without_stops_or_common_times_are_refused() -> None:
@@ -155,13 +155,3 @@ def test_recordings_without_stops_or_common_times_are_refused() -> None:
     ):
         with pytest.raises(MeasurementError, match=message):
             call()
-
-
-def test_each_stop_takes_the_image_nearest_to_its_middle() -> None:
-    joints, _ = recordings()
-    middles = np.arange(STOPS) * (STAND_S + MOVE_S) + 0.5 * STAND_S
-    times = np.concatenate([middles[1:] + 0.1, middles[1:] - 0.2, middles + 0.5 * (STAND_S + MOVE_S), [0.02]])
-    found, without = pictured(joints, times - 3.0, offset=3.0)
-    assert [time for _, time in found] == pytest.approx(list(middles[1:] + 0.1 - 3.0))
-    assert without == 1
-    np.testing.assert_allclose([q for q, _ in found], angle(middles[1:]), rtol=0, atol=5e-4)

@@ -93,11 +93,7 @@ POSES: list[Case] = [
     (POSE, {"rotation": [["a", "b", "c"], ["a", "b"]]}, "`rotation`: expected 3 names ... got ['a', 'b']"),
     (POSE, {"std": ["d", "q1"]}, "`std`: expected ... one per marker ... got ['d', 'q1']"),
     (POSE, {"std": ["a"]}, "distinct columns, got ['a'] twice"),
-    (
-        POSE,
-        NO_ROTATION | {"spherical": "zenith_gon", "std": ["a", "b", "c"]},
-        "`std` of a distance and two angles: got",
-    ),
+    (POSE, NO_ROTATION | {"spherical": "zenith_gon", "std": list("abc")}, "`std` of a distance and two angles: got"),
     (POSE, {"rotation_std": ["d", "e"]}, "`rotation_std` ... three, or one for all three axes, got ['d', 'e']"),
     (POSE, {"rotation_std": ["d", "d", "d"]}, "distinct columns, got ['d'] twice"),
     (POSE, {"rotation_std": [["d"], ["e", "f", "g"]]}, "`rotation_std`: expected as many names ... got 1 and 3"),
@@ -107,11 +103,7 @@ POSES: list[Case] = [
     (MATRICES + ",2,0,0,0,2,0,0,0,2\n", MATRIX, "line 3 ... orthonormal ... without a scale"),
     (POSE.replace("a,b,c", ",".join(RAD)), {"rotation": RAD}, "column 'a [rad]': expected deg, as stated, got rad"),
 ]
-FRAMES: dict[str, Any] = {
-    "rotation": [["a", "b", "c"], ["A", "B", "C"]],
-    "convention": "rotvec",
-    "rotation_angle": "rad",
-}
+FRAMES: dict[str, Any] = {"rotation": [[*"abc"], [*"ABC"]], "convention": "rotvec", "rotation_angle": "rad"}
 FRAMES |= {"joints": ["q"], "position": [["x", "y", "z"], ["X", "Y", "Z"]]}
 TWO_FRAMES = "q,x,y,z,a,b,c,X,Y,Z,A,B,C\n0.1,1,2,3,0.1,0.2,0.3,1,2,3,0.1,0.2,0.3\n"
 ONE_FRAME = TWO_FRAMES.partition("\n")[0] + "\n1,,,,,,,1,2,3,0,0,0\n"

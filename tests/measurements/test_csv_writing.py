@@ -19,13 +19,7 @@ import diffeo_calib as dc
 from diffeo_calib.cli.options import Units
 from diffeo_calib.cli.tables import MeasuredTable, of_robot, table_format
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import (
-    read_joints,
-    read_measurements,
-    read_observations,
-    write_measurements,
-    write_predictions,
-)
+from diffeo_calib.measurements.csv.files import read_joints, read_observations, write_measurements, write_predictions
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.observations import Observations
@@ -66,7 +60,6 @@ def poses() -> dc.Measurements:
 
 
 def on_tips() -> dc.Measurements:
-    """With a hidden frame, and deviations of each."""
     frames, (std, turns) = random_poses(10).unflatten(0, (5, 2)), 1e-3 * values(2, 5, 2, 3).abs()
     frames[2, 1] = torch.nan
     known: dict[str, Any] = {"on": ["l", "r"], "position_std": std, "rotation_std": turns}
@@ -74,7 +67,6 @@ def on_tips() -> dc.Measurements:
 
 
 def boards() -> dc.Measurements:
-    """As a camera on the tool sees them."""
     known: dict[str, Any] = {"position_std": 2e-4, "rotation_std": 1e-3, "camera_on_tool": True}
     return dc.Measurements.from_poses(some(5, seed=9).q, random_poses(5, seed=2), NAMES, **known)
 
@@ -85,6 +77,7 @@ def markers() -> dc.Measurements:
     return dc.Measurements(some(5, seed=7).q, points, NAMES, ["m", "k"], on=["l", "r"], std=1e-3)
 
 
+FURTHER = lengths(1e-4, 0.1, "CD")
 KINDS: dict[str, Any] = {
     "positions": positions,
     "positions with deviations": lambda: positions(1e-4),
@@ -103,9 +96,7 @@ KINDS: dict[str, Any] = {
     "images": images,
     "images on a tip": lambda: images(None).with_tips(["left"]),
     "poses and sockets": lambda: dc.Measurements.joined([poses(), resting()]),
-    "all": lambda: Observations.joined(
-        [positions(), lengths(), resting(), heights(), images(), lengths(1e-4, 0.1, "CD")]
-    ),
+    "all": lambda: Observations.joined([positions(), lengths(), resting(), heights(), images(), FURTHER]),
     "all in sessions": lambda: Observations.joined([positions().with_sessions(list("uvuvu")), images(), resting()]),
     "boards": boards,
     "laden": lambda: Observations.joined([poses(), heights()]).with_payload(torch.arange(9.0)),
@@ -113,7 +104,6 @@ KINDS: dict[str, Any] = {
 
 
 def assert_same(found: Any, wanted: Any) -> None:
-    """Everything but the lines and the file."""
     assert type(found) is type(wanted)
     assert found.joint_names == wanted.joint_names
     assert found.device_names == wanted.device_names
@@ -155,7 +145,6 @@ def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: P
 
 @pytest.mark.parametrize("units", [("mm", "m"), ("m", "mm")])
 def test_slides_keep_their_unit(units: tuple[str, str], tmp_path: Path) -> None:
-    """In tables, in programs and in predictions."""
     robot, path = sliding_robot(), tmp_path / "t.csv"
     data = sliding_measurements(robot, 3)
     table = table_format(Units(length=units[0], angle="deg", joint_length=units[1]))
@@ -187,12 +176,7 @@ ROTATIONS = {
 }
 NINETY = [0.0, 0.0, 0.0, 0.0, 0.0, 90.0]
 WRITTEN: list[tuple[Any, TableFormat, str, list[float]]] = [
-    (
-        Measurements([[0.5]], [[[1, 2, 3]] * 2]),
-        SI,
-        "q1,marker1_x,marker1_y,marker1_z,marker2_x,marker2_y,marker2_z",
-        [],
-    ),
+    (Measurements([[0.5]], [[[1, 2, 3]] * 2]), SI, f"q1,{','.join(f'marker{k}_{a}' for k in '12' for a in 'xyz')}", []),
     (some(2), replace(SI, joints=["a", "b"], position=["u", "v", "w"]), "a,b,u,v,w", []),
     (Measurements([[0.5]], [[1, 2, 3]]), TableFormat("mm", "rad", ";", ","), "q1;x;y;z", [0.5, 1e3, 2e3, 3e3]),
     (NO_STD, TableFormat("mm", "deg", convention="rotvec"), "q1,x,y,z,rx,ry,rz", [math.degrees(0.5), *NINETY]),
@@ -253,7 +237,6 @@ def test_what_cannot_be_written(data: Any, how: dict[str, Any], message: str, tm
 
 
 def predictions(path: Path, mean: Tensor, std: Tensor, table: TableFormat, **how: Any) -> tuple[list[str], list[float]]:
-    """Header and numbers of a line."""
     q = torch.tensor([[0.5, 0.25]], dtype=torch.float64)
     write_predictions(path, [(q, mean, std)], table, joints=NAMES, **how)
     header, row = path.read_text().splitlines()
@@ -274,26 +257,28 @@ def test_predictions_are_written(tmp_path: Path) -> None:
     points, std = torch.tensor([[[1.0, 2, 3], [4, 5, 6]]]).double(), torch.full((1, 2, 3), 1e-3, dtype=torch.float64)
     how: dict[str, Any] = {"kinds": ["revolute", "prismatic"], "prefixes": ["left_", "ball_"]}
     header, row = predictions(path, points, std, DEGREES, **how)
-    assert header == [
-        "a",
-        "b",
-        *(f"{own}{what}{axis}" for own in how["prefixes"] for what in ("", "std_") for axis in "xyz"),
-    ]
+    named = [f"{own}{what}{axis}" for own in how["prefixes"] for what in ("", "std_") for axis in "xyz"]
+    assert header == ["a", "b", *named]
     assert row == pytest.approx([q[0], 250, 1000, 2000, 3000, 1, 1, 1, 4000, 5000, 6000, 1, 1, 1], rel=1e-12)
     assert predictions(path, points[:, :1], std[:, :1], DEGREES)[0][2:] == ["x", "y", "z", "std_x", "std_y", "std_z"]
 
 
-def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text(
-        "a,b,x,y,z,d,spot,who,sd\n0,1,1,2,3,,,,\n1,2,,,,1.5,,A,0.1\n2,3,1,2,4,1.7,,B,0.1\n3,4,1,1,1,,s0,,\n"
-    )
+def test_lines_of_two_kinds_and_of_none(tmp_path: Path) -> None:
+    rows = "0,1,1,2,3,,,,\n1,2,,,,1.5,,A,0.1\n2,3,1,2,4,1.7,,B,0.1\n3,4,1,1,1,,s0,,\n"
+    (tmp_path / "t.csv").write_text("a,b,x,y,z,d,spot,who,sd\n" + rows)
     wire = ReadingColumns("distance", ("d",), "who", std=("sd",))
     sockets = {"socket": "spot", "position": POSITION}
-    data = read_measurements(tmp_path / "t.csv", NAMES, length="m", angle="rad", readings=(wire,), **sockets)
+    data = dc.read_measurements(tmp_path / "t.csv", NAMES, length="m", angle="rad", readings=(wire,), **sockets)
     assert data.kinds == ("position", "distance", "position", "distance", "position", "socket")
     assert data.line_numbers.tolist() == [2, 3, 4, 4, 5, 5]
     assert data.device_names == ["", "A", "", "B", "", "s0"]
     assert held(data.parts[1].std).tolist() == [[0.1], [0.1]]
+    (tmp_path / "t.csv").write_text("a,b,x,y,z,s\n0,1,1,2,3,nan\n1,2,nan,nan,nan,p\n2,2,NaN,NaN,NaN,p\n")
+    known: dict[str, Any] = {"length": "m", "angle": "rad", "socket": "s"}
+    assert dc.read_measurements(tmp_path / "t.csv", NAMES, POSITION, **known).device_names == ["", "p", "p"]
+    (tmp_path / "t.csv").write_text("a,b,s\n0,1,p\n1,2,nan\n2,2,p\n")
+    with pytest.raises(MeasurementError, match=r"line 3, column 's'.*name"):
+        dc.read_measurements(tmp_path / "t.csv", NAMES, **known)
 
 
 def test_readings_name_their_columns_and_units(tmp_path: Path) -> None:
@@ -302,7 +287,7 @@ def test_readings_name_their_columns_and_units(tmp_path: Path) -> None:
 
     def read(*given: Any, length: str = "mm", payload: str | None = None, **columns: Any) -> Any:
         own = (dc.ReadingColumns(*given, **columns),)
-        return read_measurements(path, NAMES, readings=own, payload=payload, length=length, angle="deg")
+        return dc.read_measurements(path, NAMES, readings=own, payload=payload, length=length, angle="deg")
 
     near = read("distance", "d", "who", payload="kg", on="left", offset_std=0.1)
     assert_close(near.values[:, 0].tolist(), [0.4, 0.5])
@@ -315,24 +300,8 @@ def test_readings_name_their_columns_and_units(tmp_path: Path) -> None:
         read("distance", "d", length="m")
 
 
-def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:
-    """As a program writes a table of numbers and names."""
-    (tmp_path / "t.csv").write_text("a,b,x,y,z,s\n0,1,1,2,3,nan\n1,2,nan,nan,nan,p\n2,2,NaN,NaN,NaN,p\n")
-    known: dict[str, Any] = {"length": "m", "angle": "rad", "socket": "s"}
-    assert read_measurements(tmp_path / "t.csv", NAMES, POSITION, **known).device_names == ["", "p", "p"]
-    (tmp_path / "t.csv").write_text("a,b,s\n0,1,p\n1,2,nan\n2,2,p\n")
-    with pytest.raises(MeasurementError, match=r"line 3, column 's'.*name"):
-        read_measurements(tmp_path / "t.csv", NAMES, **known)
-
-
-BALLS = (
-    "0.1,0.2,top,1,2,3,1",
-    "0.1,0.2,left,4,5,6,2",
-    "0.3,0.4,left,7,8,9,3",
-    "0.3,0.4,low,1,1,2,4",
-    "0.3,0.4,top,3,3,4,5",
-    "0.5,0.6,low,5,5,6,6",
-)
+BALLS = ".1,.2,top,1,2,3,1 .1,.2,left,4,5,6,2 .3,.4,left,7,8,9,3 .3,.4,low,1,1,2,4 .3,.4,top,3,3,4,5 .5,.6,low,5,5,6,6"
+BALLS = BALLS.split()
 
 
 def read_markers(folder: Path, lines: Sequence[str] = BALLS, **how: Any) -> dc.Measurements:
@@ -343,6 +312,7 @@ def read_markers(folder: Path, lines: Sequence[str] = BALLS, **how: Any) -> dc.M
 
 
 def test_lines_of_one_pose_are_one_row(tmp_path: Path) -> None:
+    """But not repeats, or lines that do not follow each other; later tables keep the order of the markers."""
     data = read_markers(tmp_path, std=["s"])
     assert data.marker_names == ("top", "left", "low"), "in the order in which they appear"
     assert data.line_numbers.tolist() == [2, 4, 7], "the first line of each row"
@@ -350,17 +320,10 @@ def test_lines_of_one_pose_are_one_row(tmp_path: Path) -> None:
     assert data.points[1].tolist() == [[3, 3, 4], [7, 8, 9], [1, 1, 2]]
     assert held(data.std)[:, :, 0].nan_to_num(0.0).tolist() == [[1, 2, 0], [5, 3, 4], [0, 0, 6]]
     assert data.q[:, 0].tolist() == [0.1, 0.3, 0.5]
-
-
-def test_a_marker_seen_again_is_another_row(tmp_path: Path) -> None:
-    """Repeats of a pose are rows, as are lines of it that do not follow each other."""
     assert len(read_markers(tmp_path, [*BALLS[:2], *BALLS[:2]])) == 2
     assert len(read_markers(tmp_path, [BALLS[0], BALLS[2], BALLS[1], BALLS[3]])) == 4
     assert len(read_markers(tmp_path, BALLS[:2], payload="s")) == 2
     assert len(read_markers(tmp_path, BALLS[:2], session="s")) == 2
-
-
-def test_later_tables_keep_the_order_of_the_markers(tmp_path: Path) -> None:
     whole = read_markers(tmp_path)
     assert isinstance(whole.origin, TableOrigin)
     assert "--marker ball=top,left,low" in whole.origin.options

@@ -11,9 +11,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.columns import Columns, JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.files import read_joints, read_poses, write_measurements
-from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.lines import read_cells, write_columns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.poses import rotation_numbers

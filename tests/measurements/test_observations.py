@@ -19,7 +19,6 @@ Tables = dict[str, Any]
 
 
 def tables() -> Tables:
-    """Four or five rows of each kind at distinct configurations."""
     q = [some(5, seed=seed).q for seed in range(10, 16)]
     return {
         "position": dc.Measurements(q[0], values(5, 3), NAMES),
@@ -36,7 +35,7 @@ def whole() -> Observations:
     return Observations.joined(list(tables().values()))
 
 
-def test_parts_and_rows_in_order(whole: Observations) -> None:
+def test_parts_and_selections_keep_their_order(whole: Observations) -> None:
     parts = tables()
     assert len(whole) == 29
     assert [part.kind for part in whole.parts] == list(parts)
@@ -47,9 +46,6 @@ def test_parts_and_rows_in_order(whole: Observations) -> None:
     assert whole.session_names == ("f/0", "f/1", "g/0", "g/1", "A", "B", "top", "device")
     assert held(whole.session).tolist()[14:21] == [0, 4, 4, 5, 5, 4, 6]
     assert whole.places.tolist() == [*[-1] * 10, 0, 0, 1, 1, 0, *[-1] * 14]
-
-
-def test_any_selection_keeps_the_order_asked_for(whole: Observations) -> None:
     chosen = [28, 0, 16, 16, 12, 5, 1]
     some_rows = whole.rows(chosen)
     assert_close(some_rows.q, whole.q[chosen])
@@ -63,15 +59,12 @@ def test_any_selection_keeps_the_order_asked_for(whole: Observations) -> None:
         whole.rows([])
 
 
-def test_positions_are_held_out_and_sockets_stay(whole: Observations) -> None:
+def test_what_is_held_out(whole: Observations) -> None:
     train, test = whole.split(0.5, seed=1)
     assert len(train) + len(test) == len(whole)
     assert "socket" not in test.kinds
     held_out = sorted(float(q) for _, test in whole.folds(4, seed=2) for q in test.q[:, 0])
     assert held_out == sorted(whole.q[[kind != "socket" for kind in whole.kinds], 0].tolist())
-
-
-def test_without_positions_whole_places_are_held_out() -> None:
     both = tables()
     blind = Observations.joined([both["socket"], both["distance"]])
     assert blind.without_device
@@ -83,13 +76,7 @@ def test_without_positions_whole_places_are_held_out() -> None:
         assert not {*train.q[:, 0].tolist()} & {*test.q[:, 0].tolist()}
 
 
-def test_copies_are_those_of_one_kind() -> None:
-    near, far = tables()["distance"], tables()["position"]
-    assert Observations.joined([far, replace(near, q=far.q)]).copies() == []
-    assert Observations.joined([far, near, near.rows([3]), far.rows([0])]).copies() == [(8, 10), (0, 11)]
-
-
-def test_the_simplest_table_that_holds_the_rows() -> None:
+def test_the_simplest_table_that_holds_the_rows_and_copies_of_one_kind() -> None:
     parts = tables()
     near = parts["distance"]
     back = Readings.joined([near.rows([4, 2]), near.rows([0])])
@@ -100,6 +87,9 @@ def test_the_simplest_table_that_holds_the_rows() -> None:
     assert isinstance(dc.Measurements.joined([parts["pose"], parts["position"]]), Observations)
     again = Observations.joined([near.rows([0, 1]), near.rows([2])]).rows([2, 0])
     assert_close(Readings.joined([again]).values, near.values[[2, 0]])
+    near, far = tables()["distance"], tables()["position"]
+    assert Observations.joined([far, replace(near, q=far.q)]).copies() == []
+    assert Observations.joined([far, near, near.rows([3]), far.rows([0])]).copies() == [(8, 10), (0, 11)]
 
 
 def test_payloads_names_lines_and_files(whole: Observations) -> None:
@@ -109,15 +99,8 @@ def test_payloads_names_lines_and_files(whole: Observations) -> None:
     assert laden.rows([28, 3]).line_numbers.tolist() == [128, 103]
     assert laden.parts[4].joint_names == ("u", "v")
     own = tables()["distance"]
-    different = (
-        laden,
-        whole,
-        whole.rows(range(28)),
-        whole.rows([1, 0]),
-        own,
-        own.with_payload(1.0),
-        replace(own, std=None),
-    )
+    lengths = own, own.with_payload(1.0), replace(own, std=None)
+    different = laden, whole, whole.rows(range(28)), whole.rows([1, 0]), *lengths
     assert len({data.sha256 for data in different}) == len(different)
     assert laden.to("cpu").sha256 == laden.sha256
     files = [part.with_columns(file_sha256=name) for part, name in zip(whole.parts, "aba", strict=False)]
@@ -145,7 +128,7 @@ def test_tables_that_cannot_be_joined(change: Callable[[Tables], list[dc.Measure
         Observations.joined(change(tables()))
 
 
-def test_deviations_of_readings() -> None:
+def test_deviations_of_readings_and_positions_beside_images() -> None:
     q = values(3, 2)
     assert held(Readings.distances(q, 1.0, std=[1.0, 2.0, 3.0]).std)[:, 0].tolist() == [1.0, 2.0, 3.0]
     seen = Readings.images(q, values(3, 2), focal=(10.0, 20.0), centre=(1.0, 2.0), std=0.2)
@@ -157,10 +140,6 @@ def test_deviations_of_readings() -> None:
             Readings.heights(q, std=std)
     with pytest.raises(MeasurementError, match=r"pass 2 per row\W*$"):  # pixels, no metres
         Readings.images(q, values(3, 3), focal=(10.0, 20.0), centre=(1.0, 2.0))
-
-
-def test_positions_beside_images_are_readings_with_their_deviations() -> None:
-    """Of every marker; poses stay poses."""
     data = some(4, markers=2)
     known = dc.Measurements(data.q, data.points, std=torch.linspace(1e-5, 8e-5, 8, dtype=torch.float64).view(4, 2))
     found = known.beside_images()

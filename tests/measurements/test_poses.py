@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from table_bank import CONVENTIONS, ORDERS, held, in_order, random_poses, random_rotations, values
+from table_bank import CONVENTIONS, ORDERS, held, in_order, random_poses, random_rotations, refused, values
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.poses import (
     angle_between,
     directions_of_frames,
@@ -36,7 +36,6 @@ EYE = torch.eye(3, dtype=torch.float64)
 
 
 def turn(axis: str, angle: float) -> np.ndarray:
-    """A turn about x, y or z, written out."""
     c, s = math.cos(angle), math.sin(angle)
     rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
     return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
@@ -57,7 +56,7 @@ def test_round_trips(angle: str) -> None:
         assert_close(found, matrices, rtol=0, atol=2e-4)
 
 
-def test_euler_angles_are_turns_in_their_order() -> None:
+def test_conventions_written_out() -> None:
     """Extrinsic: the rotation of the last letter is the leftmost factor; intrinsic: that of the first letter."""
     a, b, c = 0.3, -0.7, 2.1
     for order in ORDERS:
@@ -68,9 +67,6 @@ def test_euler_angles_are_turns_in_their_order() -> None:
         np.testing.assert_allclose(degrees[0], expected, atol=1e-14)
     matrices = rotation_matrices([[0.3, math.pi / 2, 0.4]], "XYZ")  # gimbal lock; warnings are errors here
     assert_close(rotation_matrices(rotation_numbers(matrices, "XYZ"), "XYZ"), matrices, rtol=0, atol=1e-7)
-
-
-def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     half = math.pi / 6  # a turn of 60 degrees about z
     expected = torch.from_numpy(turn("z", 2 * half))[None]
     c, s = math.cos(half), math.sin(half)
@@ -83,10 +79,6 @@ def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     ):
         assert_close(rotation_matrices([numbers], convention), expected, rtol=0, atol=1e-15)
     assert_close(rotation_matrices([[0, 0, 60]], "rotvec", angle="deg"), expected, rtol=0, atol=1e-15)
-
-
-def test_controllers_name_their_conventions() -> None:
-    """KUKA: A about z, then B about the new y, C about the newest x; Fanuc: W, P, R about the fixed x, y, z."""
     a, b, c = 0.3, -0.7, 1.1
     expected = turn("z", a) @ turn("y", b) @ turn("x", c)
     for name, numbers in (("kuka_abc", [a, b, c]), ("fanuc_wpr", [c, b, a])):
@@ -135,8 +127,24 @@ def test_points_are_an_equilateral_triangle_around_the_origin_and_lead_back(leve
     assert_close(poses_from_marks(points, lever), poses, rtol=0, atol=1e-14 * max(1.0, 1 / lever))
 
 
-def test_the_pose_of_bent_points_is_the_nearest() -> None:
-    """Against SciPy's best rotation."""
+def test_points_without_orientation_and_levers_without_length_are_refused() -> None:
+    points = mark_points(random_poses(3), 0.1)
+    points[1] = torch.tensor([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], dtype=torch.float64)
+    refused(
+        (r"row 1.*on one line.*0\.1 m", lambda: poses_from_marks(points, 0.1)),
+        (r"`points`.*\(N, 3, 3\)", lambda: poses_from_marks(torch.zeros(4, 2, 3), 0.1)),
+    )
+    for lever in (0, -0.1, math.nan, math.inf, True, "0.1", None):
+        for use, given in ((mark_points, random_poses(1)), (poses_from_marks, torch.zeros(1, 3, 3))):
+            with pytest.raises(InputError, match="`lever`"):
+                use(given, lever)  # pyright: ignore[reportArgumentType]
+
+
+def test_rounded_transforms_and_bent_points() -> None:
+    poses = random_poses(20)
+    found = rigid_poses(poses.numpy().round(5).tolist())
+    assert_close(found, poses, rtol=0, atol=2e-5)
+    assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
     lever, poses = 0.1, random_poses(30)
     points = mark_points(poses, lever) + 1e-2 * torch.from_numpy(np.random.default_rng(5).normal(size=(30, 3, 3)))
     found = poses_from_marks(points, lever)
@@ -145,29 +153,6 @@ def test_the_pose_of_bent_points_is_the_nearest() -> None:
         centred = (points[row] - points[row].mean(0)).numpy()
         best = Rotation.align_vectors(centred, marks(HOST).numpy())[0]
         assert_close(found[row, :3, :3], torch.from_numpy(best.as_matrix()), rtol=0, atol=1e-7)
-
-
-def test_points_without_orientation_and_levers_without_length_are_refused() -> None:
-    points = mark_points(random_poses(3), 0.1)
-    points[1] = torch.tensor([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], dtype=torch.float64)
-    for wrong, message in (
-        (points, r"row 1.*on one line.*0\.1 m"),
-        (torch.zeros(1, 3, 3), "row 0.*on one line"),
-        (torch.zeros(4, 2, 3), r"`points`.*\(N, 3, 3\)"),
-    ):
-        with pytest.raises(InputError, match=message):
-            poses_from_marks(wrong, 0.1)
-    for lever in (0, -0.1, math.nan, math.inf, True, "0.1", None):
-        for use, given in ((mark_points, random_poses(1)), (poses_from_marks, torch.zeros(1, 3, 3))):
-            with pytest.raises(InputError, match="`lever`"):
-                use(given, lever)  # pyright: ignore[reportArgumentType]
-
-
-def test_rounded_transforms_become_rigid() -> None:
-    poses = random_poses(20)
-    found = rigid_poses(poses.numpy().round(5).tolist())
-    assert_close(found, poses, rtol=0, atol=2e-5)
-    assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
 
 
 ROWS, STEP = 6, 1e-6

@@ -43,10 +43,8 @@ def _two_sheets(path: Path) -> None:
 def _joined_sheets(path: Path) -> None:
     """Joints and places of the same stops, in another order; the first is at zero, and no line has a remark."""
     book = openpyxl.Workbook()
-    for title, names, values in (
-        ("robot", ["q_1", "q_2", "remark"], JOINTS),
-        ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1]),
-    ):
+    both = ("robot", ["q_1", "q_2", "remark"], JOINTS), ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1])
+    for title, names, values in both:
         stops = range(7) if title == "robot" else reversed(range(7))
         rows = [["stop", *names], *([k, *own] for k, own in zip(stops, values.tolist(), strict=True))]
         sheet = book.create_sheet(title)
@@ -70,11 +68,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "two sheets of the same stops": ("t.xlsx", _joined_sheets, *NAMES),
     "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
     "an array with names": ("t.npy", _named, *NAMES),
-    "arrays": (
-        "t.npz",
-        lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.ones((2, 4)), dh=np.ones((2, 3))),
-        *NAMES,
-    ),
+    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.ones((2, 4)), dh=np.eye(3)), *NAMES),
     "arrays of columns": ("t.npz", lambda path: np.savez(path, q=JOINTS.T, p=PLACES.T, s=np.eye(3)), *NAMES),
     "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
     "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
@@ -94,7 +88,6 @@ NOTES = {
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str) -> None:
-    """Whatever the separator; what was decided is said."""
     name, write, joints, places = WRITERS[kind]
     write(tmp_path / name)
     for sep in ",;":
@@ -113,7 +106,7 @@ def test_lengths_in_every_unit(length: str, metres: float, tmp_path: Path) -> No
     torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES))
 
 
-def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
+def test_lines_columns_and_a_missing_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever size the file says that the sheet has: some programs write that of one cell."""
     _book(tmp_path / "t.xlsx")
     with ZipFile(tmp_path / "t.xlsx") as book, ZipFile(tmp_path / "one.xlsx", "w") as other:
@@ -122,15 +115,16 @@ def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
     for name in ("t.xlsx", "one.xlsx"):
         rows = CsvLines(tmp_path / name, ",").rows()
         assert [line for line, _ in rows] == list(range(4, 11))
-
-
-def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
     file = CsvLines(tmp_path / "t.npz", ",")
     (_, first), *_ = file.rows()
     assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
+    _book(tmp_path / "t.xlsx")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(MeasurementError, match=r"pip install 'diffeo_calib\[excel\]'"):
+        read_measurements(tmp_path / "t.xlsx", ["q_1", "q_2"], ["p_x", "p_y", "p_z"], **UNITS)
 
 
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
@@ -153,10 +147,3 @@ def test_other_files_are_one_clear_error(tmp_path: Path, kind: str) -> None:
         read_measurements(tmp_path / name, ["1", "2"], ["3", "4", "5"], **UNITS)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_reader_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _book(tmp_path / "t.xlsx")
-    monkeypatch.setitem(sys.modules, "openpyxl", None)
-    with pytest.raises(MeasurementError, match=r"pip install 'diffeo_calib\[excel\]'"):
-        read_measurements(tmp_path / "t.xlsx", ["q_1", "q_2"], ["p_x", "p_y", "p_z"], **UNITS)

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import LEVER
 
 
-def test_holds_detached_float64_copies() -> None:
+def test_what_a_table_holds() -> None:
     q = torch.tensor([[0.5, 1.0]], dtype=torch.float32, requires_grad=True)
     points = np.array([[1, 2, 3]])
     data = Measurements(q, points, joint_names=["a", "b"], marker_names=["tip"])
@@ -35,9 +35,6 @@ def test_holds_detached_float64_copies() -> None:
     assert (data.joint_names, data.marker_names) == (("a", "b"), ("tip",))
     assert repr(data) == "Measurements(1 row, 2 joints, 1 marker)"
     assert repr(some(4, n=3, markers=2)) == "Measurements(4 rows, 3 joints, 2 markers)"
-
-
-def test_poses_are_held_with_the_points_that_represent_them() -> None:
     poses = random_poses(5)
     data = Measurements.from_poses(some(5).q, poses, ["a", "b"], lever=0.2)
     assert_close(held(data.poses), poses, rtol=0, atol=1e-15)
@@ -67,10 +64,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"q": [[0.0, 1.0]], "points": [[1, 2, 3]], "joint_names": ["a", "a"]}, "`joint_names` ... distinct"),
     ({"q": [[0.0]], "points": [[1, 2, 3]], "marker_names": ["a", "b"]}, "`marker_names`: expected 1 ... got 2"),
     ({"points": [[1, 2, 3], [4, 5, 6], [nan] * 3]}, "`points` has 3 value(s) that are not finite"),
-    (
-        {"points": [[[1, 2, 3], [nan, nan, 6]]] * 2 + [[[1, 2, 3]] * 2]},
-        "row 0, marker 1 (and 1 more): expected three fini",
-    ),
+    ({"points": [[[1, 2, 3], [nan, nan, 6]]] * 2 + [[[1, 2, 3]] * 2]}, "row 0, marker 1 (and 1 more): expected three"),
     ({"points": [[[1, 2, 3]] * 2, [[nan] * 3] * 2, [[nan] * 3] * 2]}, "`points`, row 1, 2: no marker was seen"),
     ({"points": [[[1, 2, 3], [nan] * 3]] * 3, "marker_names": ["a", "tool"]}, "marker tool: hidden in all 3 rows"),
     ({"points": [[[1, 2, 3], [np.inf, 1, 1]]] * 3}, "`points` ... finite"),
@@ -140,7 +134,7 @@ def test_set_ups_and_loads_of_rows() -> None:
             call()
 
 
-def test_rows() -> None:
+def test_rows_and_groups() -> None:
     data = some(5)
     for index, expected in [
         (2, [2]),
@@ -158,6 +152,11 @@ def test_rows() -> None:
     for outside in (5, [0, 9], [True, False]):
         with pytest.raises(IndexError):
             data[outside]
+    step = 0.9 * REPEAT_TOLERANCE
+    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
+    data = Measurements(q, np.arange(15.0).reshape(5, 3))
+    assert data.groups().tolist() == [0, 1, 1, 2, 3]
+    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (4, 2), (4, 2, 3)])
@@ -195,7 +194,6 @@ GONE = [(0, 1), (2, 0), (2, 2)]
 
 
 def frames_on_tips() -> Measurements:
-    """Poses on three tips, with standard deviations."""
     rng = np.random.default_rng(3)
     poses = random_poses(3 * ROWS, seed=5).unflatten(0, (ROWS, 3))
     std, turns = (rng.uniform(1e-5, 1e-3, (ROWS, 3, 3)) for _ in range(2))
@@ -206,7 +204,6 @@ def frames_on_tips() -> Measurements:
 
 
 def test_frames_are_tables_of_one_frame_side_by_side() -> None:
-    """Also in another measuring frame."""
     data, T = frames_on_tips(), random_poses(ROWS, seed=8)
     covariance, moved = held(data.covariance), data.in_frames(T)
     for frame in range(3):
@@ -276,14 +273,6 @@ def test_parts_carry_poses_and_known_noise(kind: str) -> None:
         data.with_joint_names(["c"])
 
 
-def test_groups_gather_around_their_first_row_and_do_not_chain() -> None:
-    step = 0.9 * REPEAT_TOLERANCE
-    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
-    data = Measurements(q, np.arange(15.0).reshape(5, 3))
-    assert data.groups().tolist() == [0, 1, 1, 2, 3]
-    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
-
-
 @st.composite
 def repeated_measurements(draw: st.DrawFn) -> Measurements:
     """Between 2 and 8 configurations, each measured 1 to 6 times with some jitter, in random order."""
@@ -296,9 +285,7 @@ def repeated_measurements(draw: st.DrawFn) -> Measurements:
 
 
 @given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(2, 4), st.integers(0, 5))
-def test_splits_and_folds_are_complete_disjoint_and_cut_no_group(
-    data: Measurements, fraction: float, k: int, seed: int
-) -> None:
+def test_splits_and_folds_cut_no_group(data: Measurements, fraction: float, k: int, seed: int) -> None:
     row, group = (data.points[:, 0, axis].int().tolist() for axis in (0, 1))
     largest = int(torch.bincount(data.groups()).max())
     train, test = data.split(fraction, seed)
@@ -319,13 +306,22 @@ def test_splits_and_folds_are_complete_disjoint_and_cut_no_group(
     assert max(sizes) - min(sizes) <= largest
 
 
-def test_split_without_repeats_is_exact_and_depends_on_the_seed() -> None:
+def test_splits_without_repeats_and_refusals() -> None:
     data = some(100)
     first, again, second = (data.split(0.7, seed=seed)[0] for seed in (0, 0, 1))
     assert len(first) == len(second) == 70
     assert torch.equal(first.q, again.q)
     assert not torch.equal(first.q, second.q)
     assert [len(test) for _, test in data.folds(4)] == [25] * 4
+    repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
+    for data in (repeated, some(1)):
+        with pytest.raises(MeasurementError, match=r"cannot split.*2 distinct configurations.*got 1"):
+            data.split()
+    for fraction in (0.0, 1.0, 70, nan):
+        with pytest.raises(MeasurementError, match=r"`fraction`.*between 0 and 1"):
+            some(10).split(fraction)
+    with pytest.raises(MeasurementError, match=r"`k`.*at least 2"):
+        some(10).folds(1)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -341,15 +337,3 @@ def test_a_device_keeps_the_rows_that_place_it(seed: int) -> None:
     own = some(30).q, torch.ones(30, dtype=torch.float64), ["one"] * 9 + ["two"] * 21
     train, _ = Observations.joined([Readings.distances(*own), Readings.heights(*own)]).split(0.6, seed)
     assert all(part.device_names.count("one") >= FEWEST_PER_DEVICE for part in train.parts)
-
-
-def test_split_refuses_what_cannot_be_split() -> None:
-    repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
-    for data in (repeated, some(1)):
-        with pytest.raises(MeasurementError, match=r"cannot split.*2 distinct configurations.*got 1"):
-            data.split()
-    for fraction in (0.0, 1.0, 70, nan):
-        with pytest.raises(MeasurementError, match=r"`fraction`.*between 0 and 1"):
-            some(10).split(fraction)
-    with pytest.raises(MeasurementError, match=r"`k`.*at least 2"):
-        some(10).folds(1)

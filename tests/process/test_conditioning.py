@@ -1,22 +1,34 @@
-"""The process conditioned on rows: against formulas with the whole covariance, in any order, with priors of a metre."""
+"""The process conditioned on rows, against formulas with the whole covariance; slopes of covariances by scales."""
 
 from dataclasses import replace
 from typing import Any
 
 import mpmath
+import process_bank
 import pytest
 import torch
-from process_bank import Case, case
-from tangent_bank import normal
+from process_bank import Case
+from tangent_bank import SETTINGS, Setting, built, normal
 from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
-from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.regression import cholesky
+from diffeo_calib.process.scales import NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine, Hyperparameters, Pairs
 from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
+from diffeo_calib.regression.linear_rows import Evidence
+
+
+@pytest.fixture(params=list(process_bank.ROWS))
+def case(request: pytest.FixtureRequest) -> Case:
+    return process_bank.case(request.param)
+
+
+@pytest.fixture(params=list(SETTINGS))
+def setting(request: pytest.FixtureRequest) -> Setting:
+    """Measurements after the geometric calibration."""
+    return built(request.param)
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -82,10 +94,8 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
 
 
-@pytest.mark.parametrize("most", [0, 1000])
-def test_rows_may_come_in_parts_and_in_any_order(case: Case, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was expected before goes on with later rows, whose evidence is a difference."""
-    monkeypatch.setattr(cholesky, "MOST_ADDED", most)
+def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
+    """The evidence of later rows is a difference."""
     first, second, new = cut(case)
     prior, rows = case.data.prior(case.scales), torch.arange(len(case.data.x))
     both, all_of = case.part(rows[rows % 3 != 2]), case.part(rows)
@@ -104,13 +114,9 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case, most: int, monkeypa
         for actual, wanted in zip(noiseless(found, new), expected, strict=True):
             close(actual, wanted, 1e-9)
         assert_close(found.inverse @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
-        again = found.given(new.numbers, new.noise)  # a factor of three parts, or of two
+        again = found.given(new.numbers, new.noise)  # a factor of three parts
         close(noiseless(again, new)[0], noiseless(prior.given(all_of.numbers, all_of.noise), new)[0], 1e-9)
-        plain, known = found.features(new.numbers.at), before.features(new.numbers.at)
-        later = found.features(new.numbers.at, known)
-        close(found.mean(later), found.mean(plain), 1e-9)
-        close(later.between(), plain.between(), 1e-9)
-        close(later.between(plain), plain.between(), 1e-9)
+        plain = found.features(new.numbers.at)
         close(found.covariance(new.numbers.at), diagonal_blocks(plain.between(), len(new.data.x)), 1e-9)
         K, target = b.numbers.with_noise(at.between(), b.noise), b.numbers.there(before.mean(at))
         normal = torch.distributions.MultivariateNormal(target, (K + K.T) / 2)
@@ -171,7 +177,7 @@ def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | N
     E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)
     found = case.posterior.opened(E, size)
     W = found.factor.W
-    again = Factor(found.factor.L, W, W.T @ W)
+    again = Factor(found.factor.L, W)
     more = 2.0 * E if size else E / E.norm(dim=0)
     close(again.matrix, case.posterior.factor.matrix + more @ more.T, 1e-9)
     close(found.inverse, again.inverse, 1e-7)
@@ -208,7 +214,7 @@ def test_evidence_of_unknowns_is_that_of_their_covariance(case: Case) -> None:
 
 
 def test_rows_without_noise_that_are_there_twice_are_refused() -> None:
-    one = case("poses")
+    one = process_bank.case("poses")
     twice = one.part(torch.tensor([0, 0]))
     with pytest.raises(NumericalError, match="the covariance of the rows is not positive definite"):
         twice.data.prior(one.scales).given(twice.numbers, 0.0 * twice.noise)
@@ -227,7 +233,7 @@ def exactly(F: Tensor, S: Tensor, variance: Tensor, y: Tensor) -> tuple[Tensor, 
 
 def test_priors_of_a_metre_cost_no_digits() -> None:
     """Beside noise of micrometres; with the whole covariance in float64 half of them would be lost."""
-    one = case("one marker")
+    one = process_bank.case("one marker")
     some = Case(replace(one.data, place_deviation=1.0), one.scales).part(torch.arange(5))
     numbers, found = some.numbers, some.posterior
     F = numbers.with_noise(some.fields, some.noise)
@@ -237,3 +243,101 @@ def test_priors_of_a_metre_cost_no_digits() -> None:
     close(found.estimate / deviation, estimate / deviation, 1e-9)
     naive = torch.linalg.solve(F + numbers.S @ torch.diag(some.variance) @ numbers.S.T, numbers.target)
     assert float((naive - mu).abs().max()) > 1e2 * float((found.mu - mu).abs().max())
+
+
+def test_fields_without_support_vanish(setting: Setting) -> None:
+    """Fields whose displacement is far below the noise are zero exactly; all other scales stay."""
+    scales, data = setting.scales, setting.tangent_data
+    noise = data.noise(scales)
+    level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
+    lever = data.jacobian.square().mean((0, 1)).sqrt()
+    assert scales.supported(data.jacobian, noise).logarithms().isfinite().all()
+    last = scales.transmission_amplitude.clone()
+    last[-1] = 0.99 * level / lever[-1]
+    first = scales.coupled_amplitude.clone()
+    first[0] = 0.99 * level / lever[0]
+    first[1] = 1.01 * level / lever[1]
+    weak = replace(
+        scales,
+        transmission_amplitude=last,
+        coupled_amplitude=first,
+        task_amplitude=torch.tensor(0.99 * level, dtype=torch.float64),
+    )
+    found = weak.supported(data.jacobian, noise)
+    assert found.transmission_amplitude.tolist() == [*scales.transmission_amplitude[:-1].tolist(), 0.0]
+    assert found.coupled_amplitude.tolist() == [0.0, *first[1:].tolist()]
+    assert float(found.task_amplitude) == 0.0
+    for name in set(SCALES) - {"transmission_amplitude", "coupled_amplitude", "task_amplitude"}:
+        assert torch.equal(getattr(found, name), getattr(scales, name))
+    before, after = data.linearisation(weak).gram(), data.linearisation(found).gram()
+    change = (before - after).diagonal().clamp(min=0).mean().sqrt()
+    assert float(change) < 3 * level
+
+
+def test_inflated_scales_scale_the_covariance(setting: Setting) -> None:
+    """Except the parts that do not depend on them: prior of the places, known noise, slack, the smallest noise."""
+    data = setting.tangent_data
+    sensor = replace(data.noise_model.without_known, slack=0.0, smallest_noise=0.0)
+    data = replace(data, noise_model=sensor, place_deviation=1e-9)
+    scales = setting.scales
+    inflated = scales.inflated(1.7)
+    before, after = (data.linearisation(s).gram() for s in (scales, inflated))
+    assert_close(after, 1.7**2 * before, rtol=0, atol=1e-9 * float(after.abs().max()))
+    assert_close(data.noise(inflated), 1.7**2 * data.noise(scales), rtol=1e-9, atol=0)
+
+
+def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
+    """Their columns are J_l cos and J_l sin, their prior b^2; they are no scales of the search."""
+    lines = (GearLine(0, 101.3, 5e-5), GearLine(setting.data.n - 1, 40.2, 2e-5))
+    scales, data = replace(setting.scales, lines=lines), setting.tangent_data
+    with_lines = data.with_position_errors(scales)
+    assert torch.equal(scales.logarithms(), setting.scales.logarithms())
+    assert scales.from_logarithms(scales.logarithms()).lines == lines
+    assert scales.inflated(2.0).lines[1] == GearLine(setting.data.n - 1, 40.2, 4e-5)
+    expected = data.linearisation(setting.scales).gram()
+    for line in lines:
+        wave = line.frequency * (data.x[:, None, line.joint] - data.x[:, line.joint])
+        J = data.jacobian[..., line.joint]
+        added = line.amplitude**2 * torch.einsum("im,ij,jk->imjk", J, wave.cos(), J)
+        expected = expected + added.reshape(expected.shape)
+    assert_close(with_lines.linearisation(scales).gram(), expected, rtol=1e-12, atol=1e-16)
+    assert torch.equal(with_lines.target, data.target)
+    again = with_lines.with_position_errors(setting.scales)
+    assert_close(again.sensitivities, data.sensitivities, rtol=0, atol=0)
+
+
+def matrix(pairs: Pairs, scales: Hyperparameters) -> Tensor:
+    return pairs.matrix(pairs.values(scales))
+
+
+def test_matrix_is_that_of_the_linearised_model(case: Case) -> None:
+    """Of both fields, and of each by itself, where the other would hide it."""
+    names = {"transmission_amplitude", "coupled_amplitude", "task_amplitude"}
+    for kept in (names, *({name} for name in names)):
+        without = {name: torch.zeros_like(getattr(case.scales, name)) for name in names - kept}
+        alone = replace(case.scales, **without)
+        found, expected = matrix(case.data.pairs, alone), Case(case.data, alone).fields
+        assert float(expected.abs().max()) > 0.0
+        assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+        assert_close(found, found.T, rtol=0, atol=1e-14 * float(expected.abs().max()))
+
+
+def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> None:
+    """Of each kind of scale, by central differences."""
+    pairs = case.data.pairs
+    weights = normal(*case.fields.shape, seed=4)
+    point = case.scales.logarithms().requires_grad_()
+    inner = pairs.inner(pairs.values(case.scales.from_logarithms(point)), weights)
+    size = float((weights * matrix(pairs, case.scales)).abs().sum())
+    assert float(inner.detach()) == pytest.approx(float((weights * matrix(pairs, case.scales)).sum()), abs=1e-12 * size)
+    (gradient,) = torch.autograd.grad(inner, point)
+    where = point.detach()
+    for number, of_scale in enumerate(gradient):
+        step = torch.zeros_like(where)
+        step[number] = 1e-3
+
+        def at(times: float, step: Tensor = step) -> float:
+            return float((weights * matrix(pairs, case.scales.from_logarithms(where + times * step))).sum())
+
+        expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / 12e-3
+        assert float(of_scale) == pytest.approx(expected, rel=1e-6, abs=1e-9 * size)

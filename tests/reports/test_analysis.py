@@ -12,11 +12,9 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.reports.analysis import predictions
-from diffeo_calib.reports.analysis.findings import find
+from diffeo_calib.reports.analysis.findings import Deviations, find, repeats_of, stages_of
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
-from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
-from diffeo_calib.reports.html.sections import trust
-from diffeo_calib.reports.html.sentences import advice
+from diffeo_calib.reports.html.sections import advice, trust
 from diffeo_calib.robots import SimulatedArm
 
 

@@ -16,10 +16,10 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings, find
-from diffeo_calib.reports.html.sentences import figures, verdict
+from diffeo_calib.reports.html.sections import figures, verdict
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.kinds import divided
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
 SHOWN = 40

@@ -4,6 +4,7 @@ import pytest
 import torch
 from robots_bank import CHAINS, draw, every_chain
 from simulated_body import URDF_FILE
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -17,13 +18,11 @@ from diffeo_calib.runtime.chain import Compliance
 
 
 def origins(chain: Chain, q: Tensor) -> Tensor:
-    """Origins of all frames, the tip last: (N, n_all + 1, 3)."""
     frames, tip = chain.joint_frames(q), chain(q)
     return torch.cat([frames[..., :3, 3], tip[:, None, :3, 3]], dim=1)
 
 
 def columns(sag: GravitySag, compliance: Compliance) -> Tensor:
-    """(K,) True for the coefficients of one compliance."""
     return torch.cat([torch.full((other.size,), other is compliance) for other in sag.compliances])
 
 
@@ -52,14 +51,25 @@ def test_merged_places_lose_nothing(chain: Chain) -> None:
             assert unexplained(used, moment) < 1e-12
 
 
-def test_a_robot_without_lever_arms_has_no_sag() -> None:
-    """All joints turn about the tip itself."""
+def test_where_sag_and_payloads_are_not() -> None:
+    """All joints turn about the tip; a slide on another branch; payloads that cannot be."""
     joints = [Joint("a", "revolute", torch.eye(4)), Joint("b", "revolute", torch.eye(4), torch.tensor([1.0, 0, 0]))]
     chain = Chain("ball", "floor", "hand", joints)
     sag = GravitySag(chain)
     assert sag.compliances == ()
     assert sag.size == len(sag.joints) == len(sag.own) == 0
     assert GeometryMap(Geometry.nominal(chain), elastic=True).parameters == Geometry.nominal(chain).size
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
+    robot = from_dh(rows)
+    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
+        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+        assert set(sag.joints[sag.loaded].tolist()) == joints
+    robot = SimulatedArm(0).nominal
+    refused(
+        ("all payloads are 0", lambda: Payload.of_rows(robot, 0.0 * MASSES, None)),
+        ("the link of the payload", lambda: Payload.of_rows(robot, MASSES, "nowhere")),
+    )
+    assert not Payload.of_rows(robot, None, None)
 
 
 MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)
@@ -119,21 +129,3 @@ def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
     for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
         with pytest.raises(RobotError, match=words):
             with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
-
-
-def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
-    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
-    robot = from_dh(rows)
-    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
-        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
-        assert set(sag.joints[sag.loaded].tolist()) == joints
-
-
-@pytest.mark.parametrize(
-    ("masses", "at", "message"),
-    [(0.0 * MASSES, None, "all payloads are 0"), (MASSES, "nowhere", "the link of the payload")],
-)
-def test_payloads_of_rows_that_cannot_be(masses: Tensor, at: str | None, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Payload.of_rows(SimulatedArm(0).nominal, masses, at)
-    assert not Payload.of_rows(SimulatedArm(0).nominal, None, None)

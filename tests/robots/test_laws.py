@@ -57,10 +57,8 @@ FILES = {"crooked": ("world", "end"), "crooked from the middle": ("a", "end"), "
 @pytest.mark.parametrize("name", [*FILES, "simulated arm", "ur10", *VIEWS])
 def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Of tips in the base; the Jacobian where the base stands on the ground."""
-    path, (base, tips, loads) = (
-        tmp_path / "robot.urdf",
-        VIEWS.get(name, (*FILES.get(name, ("base_link", "flange")), [])),
-    )
+    path = tmp_path / "robot.urdf"
+    base, tips, loads = VIEWS.get(name, (*FILES.get(name, ("base_link", "flange")), []))
     if name == "ur10":
         path, tips = request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "ee_link"
     elif name == "simulated arm":
@@ -126,15 +124,6 @@ def test_a_reversed_chain_has_inverse_poses(chain: dc.Chain) -> None:
     assert_close(again(reordered(q, chain, again)), chain(q), rtol=0, atol=1e-13)
 
 
-@every_robot
-def test_descriptions_come_back(robot: Tree) -> None:
-    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
-    assert type(again) is type(robot)
-    assert repr(again) == repr(robot)
-    q = draw(4, robot.n)
-    assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("tips", "loads", "message"),
     [
@@ -151,13 +140,18 @@ def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: st
 
 
 @every_robot
-def test_jacobians_are_derivatives(robot: Tree) -> None:
+def test_jacobians_are_derivatives_and_descriptions_come_back(robot: Tree) -> None:
     q = draw(3, robot.n)
     slopes = vmap(jacfwd(lambda row: robot.tip_poses(row[None])[0]))(q)  # (N, tips, 4, 4, n)
     found = robot.jacobian(q).view(3, len(robot.tips), 6, robot.n)
     assert_close(found[:, :, :3], slopes[..., :3, 3, :], rtol=0, atol=1e-13)
     spin = torch.einsum("ntabj,ntcb->ntjac", slopes[..., :3, :3, :], robot.tip_poses(q)[..., :3, :3])
     assert_close(skew(found[:, :, 3:].mT), spin, rtol=0, atol=1e-13)
+    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
+    assert type(again) is type(robot)
+    assert repr(again) == repr(robot)
+    q = draw(4, robot.n)
+    assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
 
 
 def laden(robot: Tree) -> GeometryMap:
@@ -228,13 +222,8 @@ def own_features(robot: Tree, q: Tensor) -> dict[str, Tensor]:
 
 def contained(here: dict[str, Tensor], there: dict[str, Tensor]) -> float:
     """Largest part of one robot's features that no combination of the same joint's features of the other gives."""
-    left = [
-        float((there[name] @ torch.linalg.lstsq(there[name], one, driver="gelsd").solution - one).abs().max())
-        for name, one in here.items()
-        if name in there
-    ]
-    assert left
-    return max(left)
+    both, of = [(there[name], one) for name, one in here.items() if name in there], torch.linalg.lstsq
+    return max(float((own @ of(own, one, driver="gelsd").solution - one).abs().max()) for own, one in both)
 
 
 @pytest.mark.parametrize("name", ["serial", "arm", "two arms"])

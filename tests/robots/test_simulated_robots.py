@@ -57,15 +57,19 @@ def test_the_parts_add_up() -> None:
         assert least < float(getattr(parts, part).abs().mean()) < most  # as those of real arms
 
 
-def test_measurements_have_the_stated_noise() -> None:
+def test_noise_and_wrong_options() -> None:
     arm = SimulatedArm(noise=2e-5, markers=3)
     q, points = arm.measure(2000, seed=1)
     assert float((points - arm.true_points(q)).std()) == pytest.approx(2e-5, rel=0.03)
     lower, upper = arm.nominal.limits.unbind(1)
     assert bool(((q >= lower) & (q <= upper)).all())
+    wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
+    for options in wrong:
+        with pytest.raises(InputError, match="of the simulated arm"):
+            SimulatedArm(**options)
 
 
-def test_transmission_errors_are_periodic_and_of_one_joint_each() -> None:
+def test_transmission_errors_of_one_joint_each() -> None:
     arm = SimulatedArm()
     q = arm.sample(20)
     error = arm.components(q).transmission
@@ -80,9 +84,6 @@ def test_transmission_errors_are_periodic_and_of_one_joint_each() -> None:
     assert bool(present[1:3].all())
     assert present.sum(0).tolist() == [3] * 6
     assert 1e-4 <= float(waves[present].min()) <= float(waves[present].max()) <= 3e-4
-
-
-def test_one_joint_wears() -> None:
     arm, q = SimulatedArm(seed=5, lines=[(5, 100.0, 1e-4)]), SimulatedArm().sample(10)
     grown = arm.worn(5, 3.0).components(q).transmission - arm.components(q).transmission
     smooth = SimulatedArm(seed=5).components(q).transmission  # without lines, which do not grow
@@ -91,10 +92,3 @@ def test_one_joint_wears() -> None:
     torch.testing.assert_close(arm.worn(-1, 3.0).true_points(q), arm.worn(5, 3.0).true_points(q), rtol=0, atol=0)
     with pytest.raises(IndexError):
         arm.worn(6, 3.0)
-
-
-def test_wrong_options_are_explained() -> None:
-    wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
-    for options in wrong:
-        with pytest.raises(InputError, match="of the simulated arm"):
-            SimulatedArm(**options)

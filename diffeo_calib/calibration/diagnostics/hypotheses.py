@@ -21,9 +21,9 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.nominal import rigid_motions
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.linear_rows import Evidence
 from diffeo_calib.regression.tails import FACTORS
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis

@@ -29,9 +29,9 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.linear_rows import Evidence
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Hypothesis
 
@@ -305,11 +305,7 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
 def other_payloads(
     rows: SampledRows, some: TangentData, data: TangentData, scales: Hyperparameters, lines: Tensor
 ) -> Iterator[Candidate]:
-    """Payloads that would explain the rows far better than their own.
-
-    Args:
-        rows, some: those that are judged, and their measurements. data, lines: all rows, and theirs in their file.
-    """
+    """Payloads that would explain the rows far better than their own."""
     load, sag = data.nominal.load, data.nominal.elasticity
     if not load.by_row or sag is None:
         return
@@ -320,7 +316,7 @@ def other_payloads(
     E = some.motions_in_numbers(some.slopes @ full.sensitivities(some.x, some.theta)[..., loaded]) * sizes
 
     def under(codes: Tensor, factor: float) -> Process:
-        return rows.process.with_effects(loaded, factor * rows.columns(E, codes))
+        return replace(rows.process, factor=rows.process.factor.with_features(loaded, factor * rows.columns(E, codes)))
 
     columns = {"": masses} | dict(_other_columns(masses, lines))
     codes = {words: other[rows.index] / float(other.max()) for words, other in columns.items()}

@@ -37,7 +37,7 @@ from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.kinds import divided
 
 FAR = "far from where the other rows predict it"
 MAX_MARKERS_FOR_EXCHANGE, MOST_OUTLIERS = 12, 10

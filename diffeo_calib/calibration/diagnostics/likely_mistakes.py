@@ -36,8 +36,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import LONGEST_NAME, DiffeoCalibError, MeasurementError, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES
-from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
+from diffeo_calib.measurements.csv.columns import Columns, JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
@@ -421,9 +420,6 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
 
     A table that is out of step from its first line to its last is left to :func:`likely_mistake`. Where the whole table
     fits nowhere, consecutive rows that are consistent by themselves say where the joints of the others are.
-
-    Args:
-        robot: n joints. data: N rows. registration: of the whole table.
 
     Raises:
         MeasurementError: with the line, and where the right joints are.

@@ -26,11 +26,7 @@ TILT = "tilt the tool by 20 degrees or more, to several sides"
 
 
 def warn_of_open_directions(robot: Tree, data: Measurements, registration: Identification) -> None:
-    """Warn of what the measurements leave open: places, and a path that the robot could leave.
-
-    Args:
-        robot: the nominal chain. data: the measurements. registration: base and markers.
-    """
+    """Warn of what the measurements leave open: places, and a path that the robot could leave."""
     for text in undetermined_places(robot, data.q, registration, rigid=data.lever is not None):
         warn_user(f"{text}.")
     if len(data) >= gates.PATH_POSES:  # three points always lie in a plane
@@ -96,11 +92,7 @@ def sampled_configurations(chain: Tree) -> Tensor:
 
 
 def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
-    """Warn of directions of the ball and joints that rows which tell no coordinates do not show.
-
-    Args:
-        data: the rows around the geometric calibration. devices: where readings were found to come from.
-    """
+    """Warn of directions of the ball and joints that rows which tell no coordinates do not show."""
     if not data.shared.shape[2]:
         return
     whole = data.nominal.jacobian(data.x, data.theta)

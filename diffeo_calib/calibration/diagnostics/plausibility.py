@@ -43,7 +43,7 @@ from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import joint_name_fix
 from diffeo_calib.sensors.devices import check_devices
-from diffeo_calib.sensors.tables import sees_frame
+from diffeo_calib.sensors.kinds import sees_frame
 
 
 def check_joints(robot: Tree, data: Any) -> None:
@@ -108,12 +108,7 @@ def quantum(values: Tensor, *, turning: bool) -> tuple[float, str] | None:
 
 
 def warn_of_rounding(robot: Tree, data: Any, tangent: TangentData, left_out: LeaveOneOut) -> None:
-    """Warn if the joint values have so few digits that their rounding explains much of the remaining error.
-
-    Args:
-        robot: n joints. data: N rows. tangent: the same around the geometric calibration.
-        left_out: leave-one-out errors.
-    """
+    """Warn if the joint values have so few digits that their rounding explains much of the remaining error."""
     each = [quantum(values, turning=turns) for values, turns in zip(data.q.unbind(1), robot.periodic, strict=True)]
     steps = {name: step for name, step in zip(robot.joint_names, each, strict=True) if step is not None}
     if not steps or len(data) < gates.DIGIT_ROWS:
@@ -214,12 +209,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
 
 
 def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identification, fit: Identification) -> None:
-    """Warn of rows that show no errors of the robot: they may have been computed, not measured.
-
-    Args:
-        robot: n joints. data: the rows around the geometric calibration.
-        registration: base and markers, or ball and devices. fit: the geometric calibration.
-    """
+    """Warn of rows that show no errors of the robot: they may have been computed, not measured."""
     points = data.nominal(data.x, torch.zeros_like(data.theta))
     predicted = points if data.observe is None else data.observe.value(points)
     rms = float((data.y - predicted)[data.visible].square().mean().sqrt())

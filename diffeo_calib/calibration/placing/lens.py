@@ -11,8 +11,15 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
-from diffeo_calib.calibration.placing.sessions import Sessions
+from diffeo_calib.calibration.placing.placement import (
+    DeviceSet,
+    Elsewhere,
+    OtherRows,
+    Placement,
+    Seen,
+    Sessions,
+    Settled,
+)
 from diffeo_calib.cameras.board import LENS, BoardPrior
 from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
@@ -109,6 +116,7 @@ class LensAndBoard(CameraErrors):
         larger: how much longer lengths in the images are than those of the robot, as a share.
     """
 
+    size_advice = "measure the printed squares with a caliper and give `images --board-std`"
     lever: float
     apart: Tensor
     larger: float
@@ -220,9 +228,6 @@ class LensAndBoard(CameraErrors):
                 "board's size explains them as well, until its squares are measured"
             )
         return lines
-
-    def size_advice(self) -> str:
-        return "measure the printed squares with a caliper and give `images --board-std`"
 
     def entry(self) -> dict[str, object]:
         entries = {

@@ -38,15 +38,8 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.lens import BoardSize, LensAndBoard
-from diffeo_calib.calibration.placing.placement import Elsewhere, OtherRows, Placement
-from diffeo_calib.calibration.placing.readings import (
-    ReadingDevices,
-    ball_of,
-    reading_sets,
-    register_ball,
-    resting_rows,
-)
-from diffeo_calib.calibration.placing.sessions import Drift, Sessions
+from diffeo_calib.calibration.placing.placement import Drift, Elsewhere, OtherRows, Placement, Sessions
+from diffeo_calib.calibration.placing.readings import ReadingDevices, ball_of, reading_sets, register_ball, resting_rows
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
@@ -63,14 +56,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.tables import (
-    Coordinates,
-    ball_tip,
-    check_poses,
-    divided,
-    sees_frame,
-    with_markers,
-)
+from diffeo_calib.sensors.kinds import Coordinates, ball_tip, check_poses, divided, sees_frame, with_markers
 
 
 class Told(NamedTuple):
@@ -172,13 +158,9 @@ class Placed:
         return [devices.elsewhere(row, points, self.placement) for devices in self.placement]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
-        """Move the devices to where a fit puts them, and with all markers of the model.
-
-        Args:
-            fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
-        """
+        """Move the devices to where a fit puts them, and with all markers of the model."""
         here = torch.eye(4, dtype=chosen.data.y.dtype, device=chosen.data.y.device)
-        placement = self.placement.settled(fitted, fitted_map, chosen.data, here, chosen=chosen)
+        placement = self.placement.settled(fitted, fitted_map, chosen.data, here)
         aligned = self.coordinates
         if aligned is not None:
             aligned = aligned._replace(table=with_markers(aligned.table, self.registration.geometry.markers))
@@ -228,9 +210,6 @@ class Placed:
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.
-
-        Args:
-            data: rows of every kind of the calibration. like: the rows of the calibration.
 
         Raises:
             MeasurementError: rows of another device.

@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf, nan
+from math import inf
 from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.expected_errors import ExpectedError
@@ -38,15 +37,13 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import KIND, SEPARATOR, Readings, SocketReadings
-from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import fitting_devices
 from diffeo_calib.sensors.devices import VALUE, Devices, Hypothesis, check_devices
-from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.kinds import OtherReadings, kind_of
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import OtherReadings
 from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
 
@@ -111,8 +108,6 @@ class SocketDevices(ReadingDevices):
 
     devices: SocketPlaces
     data: SocketReadings
-    # root mean square distance of the ball from the middle of its socket, every place predicted by all other rows, m
-    left_out_spread: float = nan
 
     @property
     def sockets(self) -> SocketReadings:
@@ -152,39 +147,14 @@ class SocketDevices(ReadingDevices):
             B = frame_slopes(moved[None], moved.mean(0))[0]
             root = root - B @ (torch.linalg.pinv(B) @ root)
         std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt().view_as(moved)
-        settled = replace(self, devices=replace(self.devices, constants=moved, deviations=std, before=()))
-        if fit.chosen is None:
-            return settled
-        away = socket_errors(self.left_out(fit.chosen), self.device, self.sockets)[0]
-        return replace(settled, left_out_spread=float(away.square().sum(1).mean().sqrt()))
-
-    def left_out(self, chosen: ChosenScales) -> Tensor:
-        """The ball (M, 3) as predicted without the rows of its place, m: with A their block of (G + R)^-1, by A^-1 mu.
-
-        What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
-        """
-        process, device = chosen.data.process(chosen.selection.scales), self.by_row(len(chosen.data.y))
-        numbers, shared = process.numbers, process.numbers.of_table(chosen.data.shared)
-        place = torch.where(device == NO_SOCKET, NO_SOCKET, self.sockets.place[device])[numbers.owner]
-        errors = process.left_out(place)[0]
-        for number in place[place >= 0].unique():
-            index = (place == number).nonzero()[:, 0]
-            others = process.mu - process.inverse[:, index] @ errors[index]  # K^-1 y without the place
-            errors[index] += shared[index] @ (shared.T @ others)
-        return self.positions[self.device] - numbers.in_table(errors)[self.rows, :3]
+        return replace(self, devices=replace(self.devices, constants=moved, deviations=std, before=()))
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Nothing: sockets without a known distance are warned of at the start."""
 
     def entry(self) -> dict[str, object]:
-        """Positions by name, and spread of places left out, for programs; in m."""
-        positions = dict(zip(self.names, self.positions.tolist(), strict=True))
-        return {"sockets": {"positions_m": positions, "left_out_spread_m": self.left_out_spread}}
-
-    def sentences(self) -> list[str]:
-        what = "spread within sockets, each place left out"
-        among = "; deviations of sockets are among them where no device measured positions"
-        return [*super().sentences(), f"{what}: {1e3 * self.left_out_spread:.4f} mm{among}"]
+        """Positions by name, for programs, in m."""
+        return {"sockets": {"positions_m": dict(zip(self.names, self.positions.tolist(), strict=True))}}
 
 
 def reading_sets(readings: Sequence[OtherReadings], devices: Sequence[Devices]) -> tuple[ReadingDevices, ...]:

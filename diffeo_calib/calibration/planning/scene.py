@@ -48,8 +48,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.kinds import device_coordinates
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import device_coordinates
 
 USUAL_RESIDUAL = 3e-4
 """Residual of the geometric calibration of an industrial robot per coordinate, relative to the markers' spread."""

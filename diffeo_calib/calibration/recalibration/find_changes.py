@@ -37,8 +37,8 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
+from diffeo_calib.regression.linear_rows import Evidence
 
 LEVEL = 0.01  # probability that anything is named although nothing has changed
 
@@ -206,9 +206,6 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
 
     Rows that follow one another, or are a session of their own, and deviate together are no outliers.
 
-    Args:
-        rows: seen by the old model. level: see :class:`Changes`. seed: of the samples.
-
     Returns:
         what was found, and what may drift: nothing where only a part of the rows shows a change.
 
@@ -318,11 +315,7 @@ RANK_TOLERANCE = 1e-9  # smallest eigenvalue of correlations, relative to the la
 
 
 def hidden_offsets(set_up: NewSetUp, changes: Changes) -> tuple[Offset, ...]:
-    """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
-
-    Args:
-        set_up: where device and markers are. changes: as the rows show them.
-    """
+    """Offsets that explain where a registration found device or markers; none where a change of the robot is named."""
     rows, record = set_up.registered, set_up.registration
     if rows is None or record is None or changes.found:
         return ()

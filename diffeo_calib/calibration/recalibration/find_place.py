@@ -29,14 +29,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.registered_map import (
-    HARDLY,
-    Registration,
-    fitted_markers,
-    robot_map,
-    turned,
-    undetermined,
-)
+from diffeo_calib.kinematics.registered_map import HARDLY, Registration, fitted_markers, robot_map, turned, undetermined
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
@@ -46,7 +39,7 @@ from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.devices import CHANGE
-from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.kinds import Coordinates
 
 FREE = ("both", "base", "marker")
 MARKER_DEVIATIONS = {
@@ -307,11 +300,7 @@ def worst_rows(rows: NewRows) -> list[int]:
 
 
 def opened(rows: NewRows, data: Any) -> NewRows:
-    """The rows beside what has changed of device and tool among them; as they are if nothing has.
-
-    Args:
-        rows: new rows. data: the same as they were measured.
-    """
+    """The rows beside what has changed of device and tool among them; as they are if nothing has."""
     if len(rows) < 4 * gates.CHANGE_ROWS:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement

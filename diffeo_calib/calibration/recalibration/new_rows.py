@@ -17,9 +17,8 @@ from torch.nn.functional import pad
 
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
-from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
+from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, Sessions
 from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
-from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -30,15 +29,14 @@ from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import Process
-from diffeo_calib.regression.linear_rows import LinearRows
+from diffeo_calib.regression.linear_rows import Evidence, LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.regression.tails import Tails, estimated, gross_weights
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.coordinates import errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings
+from diffeo_calib.sensors.kinds import Coordinates, OtherReadings
 
 MAX_STEPS = 100
 SMALL_STEP = 1e-2  # below such a step of the markers, m, C hardly changes

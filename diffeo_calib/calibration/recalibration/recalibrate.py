@@ -310,12 +310,7 @@ class Comparison:
 @small_work()
 @outside_inference_mode
 def compare(
-    model: CalibratedKinematics,
-    other: Any,
-    *,
-    marker: Marker = "evidence",
-    level: float = LEVEL,
-    seed: int = 0,
+    model: CalibratedKinematics, other: Any, *, marker: Marker = "evidence", level: float = LEVEL, seed: int = 0
 ) -> Comparison:
     """Find what has changed since a calibration.
 

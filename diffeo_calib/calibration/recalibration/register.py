@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from diffeo_calib.calibration.placing.placement import Sessions
 from diffeo_calib.calibration.placing.readings import ball_of
-from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.recalibration.drift import ChangedPart, grown, parts_of
 from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
@@ -40,8 +40,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import rows_used_in_fit
-from diffeo_calib.kinematics.joint_ranges import check_same_robot
+from diffeo_calib.kinematics.evaluation import check_same_robot, rows_used_in_fit
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, fitted_markers, moved, robot_map
 from diffeo_calib.maps.deformation import Momenta
@@ -55,9 +54,7 @@ from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, mounted_of, sensor_of, with_earlier_cameras
 from diffeo_calib.sensors.devices import Extrinsics
-from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import (
+from diffeo_calib.sensors.kinds import (
     ball_tip,
     check_markers,
     divided,
@@ -66,6 +63,8 @@ from diffeo_calib.sensors.tables import (
     with_markers,
     with_points,
 )
+from diffeo_calib.sensors.known_drift import KnownDrift
+from diffeo_calib.sensors.set_ups import frame_slopes
 
 LOG = logging.getLogger(__name__)
 LARGEST_M_RAD = 0.03  # deviation of a place, m or rad, from which its rows teach nothing about the robot

@@ -237,9 +237,6 @@ def with_best_seen_point(data: Measurements, fit: Identification) -> Measurement
     """The measurements with the point in the place of the board's origin; unchanged unless a camera is on the tool.
 
     Known deviations are those of the origin, and boards of several sessions have no point in common: the origin stays.
-
-    Args:
-        data: N rows. fit: their geometric calibration.
     """
     view = seen_board(data)
     if view is None or data.covariance is not None:

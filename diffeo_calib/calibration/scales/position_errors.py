@@ -32,9 +32,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import GearLine, Hyperparameters, axis_deviations, joint_weights
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.linear_rows import Evidence
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.runtime.build import axis_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles

@@ -119,10 +119,6 @@ class LogPosterior(NamedTuple):
 def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData) -> LogPosterior | None:
     """Log posterior density of scales given by their logarithms, and its gradient by these.
 
-    Args:
-        logarithms: of the scales, see :meth:`Hyperparameters.logarithms`.
-        centre: centre of the prior. data: the measurements.
-
     Returns:
         None where G + R is not positive definite in float64.
     """

@@ -17,18 +17,15 @@ from diffeo_calib.campaign.campaign import TOGETHER, Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Inbox, as_line, check_cells, read_lines
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
-from diffeo_calib.cli.console import err, interrupts, plain, say
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain, record, say
 from diffeo_calib.cli.declarations import CampaignOptions
-from diffeo_calib.cli.models import robot_of
-from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
-from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
+from diffeo_calib.cli.models import EXIT_ABOVE, parsed_length, robot_of
 from diffeo_calib.cli.tables import MeasuredTable, measured_table, of_robot
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.columns import Columns, PoseColumns
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.joined import HeldFile
-from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import columns_of
 from diffeo_calib.measurements.table_format import ZERO
 from diffeo_calib.reports.live import Page, served, state_of

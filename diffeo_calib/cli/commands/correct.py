@@ -10,16 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
+from diffeo_calib.cli.console import out, plain, progress_bar, record, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import as_written, of_robot, table_format, targets_of, with_rotation
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
+from diffeo_calib.kinematics.evaluation import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints

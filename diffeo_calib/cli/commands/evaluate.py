@@ -15,30 +15,20 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.judged_rows import evaluate, expected_rms, judge, outlier_lines
 from diffeo_calib.calibration.expected_errors import accuracy
-from diffeo_calib.cli import models, printed
-from diffeo_calib.cli.console import out, plain, progress_bar, say
+from diffeo_calib.cli import models
+from diffeo_calib.cli.console import entries_by_kind, out, plain, progress_bar, record, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions
 from diffeo_calib.cli.options import Rows, Units
-from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics import evaluation
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
-from diffeo_calib.kinematics.evaluation import (
-    check_rows,
-    place,
-    placement_sentences,
-    positions_of,
-    residuals,
-    rows_of_other_frames,
-    rows_used_in_fit,
-    unseen,
-)
+from diffeo_calib.kinematics.evaluation import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.kinematics.hand_eye import IN_TIP, HandEye
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions
@@ -63,18 +53,18 @@ def run(options: EvaluateOptions) -> None:
         fix = "name it, or write a page about the rows of the fit by --report"
         raise InputError.of("the table of measurements", expected="CSV", got="none", fix=fix)
     source = models.table_of(model, options.csv, options)
-    limit = printed.parsed_limit(options.tolerance)
+    limit = models.parsed_limit(options.tolerance)
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
     data = source.read(model.robot)
     say(*repeated_lines(model, data.q))
     if options.free is not None:
         return _registered(model, data, options)
-    check_rows(model, data)
-    places = place(model, data, every_session=source.table.session is not None)
-    by_kind, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
+    evaluation.check_rows(model, data)
+    places = evaluation.place(model, data, every_session=source.table.session is not None)
+    by_kind, used = evaluation.residuals(model, places, data), evaluation.rows_used_in_fit(model, data.q)
     judged = judge(model, places, data, by_kind)
-    _show(model, by_kind, used, positions_of(model, places, data), options.model.name)
+    _show(model, by_kind, used, evaluation.positions_of(model, places, data), options.model.name)
     if options.output is not None:
         write_rows(options.output, COLUMNS, [list(_residuals(by_kind, used, source))], source.table)
         record.add(files={"residuals": options.output})
@@ -84,10 +74,10 @@ def run(options: EvaluateOptions) -> None:
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
     say(*map(plain, places.found))
-    say(*(line for errors in by_kind.values() for line in printed.socket_lines(errors, "all rows")))
-    say(*printed.expectation_lines(model, data))
+    say(*(line for errors in by_kind.values() for line in models.socket_lines(errors, "all rows")))
+    say(*models.expectation_lines(model, data))
     warn_outside_range(model, data.q)
-    source.warn_of_other_frames(rows_of_other_frames(model, data.q))
+    source.warn_of_other_frames(evaluation.rows_of_other_frames(model, data.q))
     if judged.refusal is not None:
         raise MeasurementError(judged.refusal)
     positions = 0 if by_kind.positions is None else len(by_kind.positions.errors)
@@ -97,7 +87,7 @@ def run(options: EvaluateOptions) -> None:
         warn_user(text)
     if limit is not None:
         new, which = (by_kind, "") if bool(used.all()) else (by_kind.rows(~used), " not used in the fit")
-        printed.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
+        models.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
 def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: Measurements | None, name: str) -> None:
@@ -117,7 +107,7 @@ def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: M
         expected = expected_rms(model, data, errors.errors.shape[1]) if positions and data is not None else None
         labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
         rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
-        out.print(printed.ErrorTable(rows, f"of {plain(name)}", "rows", expected=expected))
+        out.print(models.ErrorTable(rows, f"of {plain(name)}", "rows", expected=expected))
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
     record.add(files={}, **entries_by_kind(named))
@@ -145,25 +135,25 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     record.add(files={} if output is None else {"model": output})
     record.add(**entries_by_kind({kind: {"after": after} for kind, after in kinds.items()}))
     has_before = registered.registration is not None and registered.registration.rms_before is not None
-    before = residuals(model, place(model, data), data) if has_before else None
+    before = evaluation.residuals(model, evaluation.place(model, data), data) if has_before else None
     for kind, after in kinds.items():
         rows = {} if before is None else {(f"{after.count} with the places of the fit",): before[kind]}
         rows |= {(f"{after.count} with places found anew",): after}
-        out.print(printed.ErrorTable(rows, f"of {plain(options.model.name)}", "rows"))
-    say(*map(plain, (*printed.registration_lines(registered), *placement_sentences(registered))))
+        out.print(models.ErrorTable(rows, f"of {plain(options.model.name)}", "rows"))
+    say(*map(plain, (*models.registration_lines(registered), *evaluation.placement_sentences(registered))))
     if output is not None:
         say(f"registered model: {output}")
 
 
 def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions) -> None:
     """Write the page, and say its first line."""
-    from diffeo_calib.reports.html.sentences import advice, verdict  # noqa: PLC0415  # slow to import, they draw
+    from diffeo_calib.reports.html.sections import advice, verdict  # noqa: PLC0415  # slow to import, they draw
     from diffeo_calib.reports.report import write_report  # noqa: PLC0415
 
-    data, tolerance = None, printed.parsed_length(options.tolerance)
+    data, tolerance = None, models.parsed_length(options.tolerance)
     if options.csv is not None:
         data = models.table_of(model, options.csv, options).read(model.robot)
-    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
+    if tolerance is not None and data is not None and not bool(evaluation.unseen(model, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     with progress_bar() as progress:
@@ -179,9 +169,9 @@ def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions)
     if data is not None and not findings.new:
         each = "as fitted" if not findings.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words, *printed.expectation_lines(model, None, findings.deviations.error), f"report: {page}")
+    say(words, *models.expectation_lines(model, None, findings.deviations.error), f"report: {page}")
     if tolerance is not None and findings.judged.value > tolerance:
-        raise typer.Exit(printed.EXIT_ABOVE)
+        raise typer.Exit(models.EXIT_ABOVE)
 
 
 # --- predictions

@@ -12,25 +12,16 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
-from diffeo_calib.cli.console import out, plain, say, text_table
+from diffeo_calib.cli.console import make_folder, out, plain, record, say, text_table
 from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_together
+from diffeo_calib.interop import rigid as fitted
+from diffeo_calib.interop import tables as controller
 from diffeo_calib.interop.c_source import CFiles, write_c
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text, ur_text, ur_transforms
-from diffeo_calib.interop.rigid import Compared, RigidKinematics, best_joint_offsets, rigid_kinematics, with_errors
-from diffeo_calib.interop.tables import (
-    CorrectionTable,
-    correction_tables,
-    field_text,
-    in_unit,
-    offsets_text,
-    origin_numbers,
-    tables_text,
-)
 from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.urdf import corrected_urdf, mjcf_text, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -67,7 +58,7 @@ class _Export:
     def __init__(self, model: CalibratedKinematics, given: ExportOptions) -> None:
         self.model, self.given = model, given
         self.files: dict[str, bytes] = {}
-        self.rows: dict[str, RigidKinematics] = {NOMINAL: with_errors(model, None)}
+        self.rows: dict[str, fitted.RigidKinematics] = {NOMINAL: fitted.with_errors(model, None)}
         self.lines: list[str] = []
         self.geometry: Geometry | None = None
 
@@ -78,10 +69,11 @@ class _Export:
         if new is not None and new.is_file() and new.read_bytes() == urdf:
             fix = "name another file: later fits need the robot as it is now"
             raise InputError.of(f"--urdf {new} is the robot's own URDF", fix=fix)
-        rigid = rigid_kinematics(self.model, transmission=tables)
+        rigid = fitted.rigid_kinematics(self.model, transmission=tables)
         self.geometry, name = rigid.geometry, ", ".join(options)
-        alone = {f"{name} alone": with_errors(self.model, rigid.geometry.joint_errors, rigid.how)} if tables else {}
-        self.rows |= {f"{name} and --correction-tables" if tables else name: rigid} | alone
+        self.rows |= {f"{name} and --correction-tables" if tables else name: rigid}
+        if tables:
+            self.rows[f"{name} alone"] = fitted.with_errors(self.model, rigid.geometry.joint_errors, rigid.how)
         self.lines += [TOGETHER] * tables
         said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in rigid.validated.items())
         self.lines.append(f"rigid kinematics from the {rigid.how} (cross-validated: {said})")
@@ -112,17 +104,17 @@ class _Export:
         """Joint offsets alone, correction tables for the nominal robot, corrections on a grid."""
         length, angle = self.given.length, self.given.angle
         if "--joint-offsets" in wanted:
-            offsets = best_joint_offsets(self.model)
+            offsets = fitted.best_joint_offsets(self.model)
             self.rows["--joint-offsets"] = offsets.rigid
-            self.files["--joint-offsets"] = offsets_text(offsets, self.model.robot, length, angle).encode()
+            self.files["--joint-offsets"] = controller.offsets_text(offsets, self.model.robot, length, angle).encode()
             self.lines.append(OFFSETS)
         if "--correction-tables" in wanted:
-            tables = correction_tables(self.model)
-            self.rows["--correction-tables, nominal robot"] = with_errors(self.model, None, transmission=True)
-            self.files["--correction-tables"] = tables_text(tables, length, angle).encode()
+            tables = controller.correction_tables(self.model)
+            self.rows["--correction-tables, nominal robot"] = fitted.with_errors(self.model, None, transmission=True)
+            self.files["--correction-tables"] = controller.tables_text(tables, length, angle).encode()
             self.lines += _table_lines(tables)
         if "--field" in wanted:
-            self.files["--field"] = field_text(self.model, self.given.grid, length).encode()
+            self.files["--field"] = controller.field_text(self.model, self.given.grid, length).encode()
             self.lines += FIELD
 
     def camera(self, folder: Path) -> dict[Path, bytes]:
@@ -193,13 +185,13 @@ def _limits(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
         yield f"no file knows the {' or the '.join(drift.names)}: they hold at {drift.holds()}"
 
 
-def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:
+def _show(model: CalibratedKinematics, rows: Mapping[str, fitted.RigidKinematics]) -> None:
     """Print how far each export is from the model, and about how far from new measurements."""
     summary = model.summary
     about, new = (None if summary is None else summary.leave_one_out_rms), "new measurements, about"
     if about is None or stands_free(model):  # no position was measured
         about, new = ExpectedError.of(model).whole, "true positions, about"
-    title = f"Distance from the model over {Compared.of(model).where}, mm"
+    title = f"Distance from the model over {fitted.Compared.of(model).where}, mm"
     lines: list[tuple[str, list[float | None]]] = []
     for name, rigid in rows.items():
         left_out = rigid.validated.get(rigid.how)
@@ -215,15 +207,16 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
 def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
-        numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)
-        words = [f"{' '.join(f'{value:.6g}' for value in in_unit(values, unit))} {unit}" for values, unit in numbers]
+        numbers = zip(controller.origin_numbers(transform), (given.length, given.angle), strict=True)
+        each = ((controller.in_unit(values, unit), unit) for values, unit in numbers)
+        words = [f"{' '.join(f'{value:.6g}' for value in values)} {unit}" for values, unit in each]
         yield f"DH {name} (x y z, roll pitch yaw): {', '.join(words)}"
     parallel = [name for name, row in zip(table.names, table.rows, strict=True) if row.beta]
     if parallel:
         yield f"DH rows with Hayati's beta, next to parallel axes: {', '.join(parallel)}"
 
 
-def _table_lines(tables: list[CorrectionTable]) -> Iterator[str]:
+def _table_lines(tables: list[controller.CorrectionTable]) -> Iterator[str]:
     """Sign and range of the tables."""
     yield "correction tables: a controller adds the correction to the joint value that it is to reach"
     yield "  they hold transmission errors of single joints, neither geometric errors nor gravity sag"

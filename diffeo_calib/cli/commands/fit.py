@@ -1,4 +1,4 @@
-"""`diffeo-calib fit`: calibrate, show errors, write the model; `demo`: an arm for it."""
+"""`diffeo-calib fit`: calibrate, show errors, write the model; `demo`: an arm for it; `recalibrate`: what changed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import logging
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import isfinite
 from typing import Any
 
 import typer
@@ -13,17 +14,16 @@ import typer
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, check_errors, contradicted, outlier_lines
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
+from diffeo_calib.calibration.recalibration.find_changes import Changes, Offset
+from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, compare, recalibrate
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
-from diffeo_calib.cli import printed
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
-from diffeo_calib.cli.declarations import DemoOptions, FitOptions
+from diffeo_calib.cli import console, models
+from diffeo_calib.cli.declarations import DemoOptions, FitOptions, RecalibrateOptions
 from diffeo_calib.cli.main import app
-from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
-from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, MeasurementError, few
+from diffeo_calib.common.errors import PACKAGE, InputError, MeasurementError, few
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.evaluation import positions_of
+from diffeo_calib.kinematics.evaluation import positions_of, repeated_lines, warn_outside_range
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -32,7 +32,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.kinds import divided
 
 EXIT_UNCONVERGED = 3
 LARGE_SHARE = 0.5  # of the expected error, from which the robot's size is said to be worth measuring
@@ -43,9 +43,9 @@ Errors = dict[str, dict[str, Evaluation]]  # errors by the kind of rows and by s
 def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     source = measured_table(given.csv, given, given.duplicates)
-    with progress_bar() as progress:
-        chain = robot_of(given, source)
-        others = [load_kinematics(path) for path in given.scales_of or ()]
+    with console.progress_bar() as progress:
+        chain = models.robot_of(given, source)
+        others = [models.load_kinematics(path) for path in given.scales_of or ()]
         data = source.read(chain, given.tip or chain.tips)
         try:
             train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
@@ -54,31 +54,32 @@ def run(given: FitOptions) -> None:
                 refuse_mistakes(chain, positions.table)  # in a wrong unit all rows are one configuration
             raise
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
-        result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
-        result = replace(result, model=made_by_command(result.model, source))
+        result = calibrate(chain, train, **how, progress=console.interrupts.watching(progress, console.err.print))
+        result = replace(result, model=models.made_by_command(result.model, source))
     hand_eye = HandEye.of_fit(result.model)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
     each = {name: solved.entry() for name, solved in hand_eye.items()}
-    record.add(**({"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))))
+    if each:
+        console.record.add(**({"hand_eyes": each} if len(each) > 1 else {"hand_eye": each.popitem()[1]}))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
-    say(*_verdict(result, judged))
+    console.say(*_verdict(result, judged))
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
     wrong: Sequence[Outlier] = ()
     if test is not None:
         measured = positions_of(result.model, result.places(), test)
         wrong = [] if measured is None else contradicted(result.model, measured)
-        say(*outlier_lines(wrong, len(test), "held-out rows"))
-    say(*_lines_about_places(result, data, held_out, hand_eye))
-    say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
+        console.say(*outlier_lines(wrong, len(test), "held-out rows"))
+    console.say(*_lines_about_places(result, data, held_out, hand_eye))
+    console.say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
-        with progress_bar() as progress:
+        with console.progress_bar() as progress:
             how = {"stages": result.stages, "places": {stage: result.places(stage) for stage in result.stages}}
             shown = train if test is None else test
-            write_report(result.model, given.report, shown, **how, warnings=record.warnings, progress=progress)
-        say(f"report: {given.report} (open it in a browser)")
+            write_report(result.model, given.report, shown, **how, warnings=console.record.warnings, progress=progress)
+        console.say(f"report: {given.report} (open it in a browser)")
     _end(result, in_train, held_out or in_train)
 
 
@@ -94,13 +95,13 @@ def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:
         rms, most, before = (f"{1e3 * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
         yield f"held out: {rms} mm RMS, 95 % below {most} ({model.count} rows; geometry alone {before} mm RMS)"
     if not judged:
-        yield printed.stage_line(result.model, result.stages, result.expected)
+        yield models.stage_line(result.model, result.stages, result.expected)
 
 
 def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
     """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
-    if result.interrupted or interrupts.asked:
-        raise typer.Exit(EXIT_INTERRUPTED)
+    if result.interrupted or console.interrupts.asked:
+        raise typer.Exit(console.EXIT_INTERRUPTED)
     for stages, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
         check_errors(result.model, stages[CALIBRATED], fitted[GEOMETRIC].median)
     if not result.fit.converged:
@@ -116,7 +117,7 @@ def _lines_about_places(
         placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
     for stages in held_out.values():
-        yield from printed.socket_lines(stages[CALIBRATED], "held out")
+        yield from models.socket_lines(stages[CALIBRATED], "held out")
     positions, _ = divided(data)
     if positions is not None:
         measured = positions.table
@@ -125,9 +126,9 @@ def _lines_about_places(
             yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
     if _of_positions(held_out):  # else they are the verdict
-        yield printed.stage_line(result.model, result.stages, result.expected)
-    yield from printed.expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (device.size_advice() for device in result.placement)), None)
+        yield models.stage_line(result.model, result.stages, result.expected)
+    yield from models.expectation_lines(result.model, data, result.expected)
+    advice = next(filter(None, (device.size_advice for device in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
@@ -139,11 +140,11 @@ def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given
     both = {"training": in_train, "held_out": held_out}
     kinds = {kind: {rows: errors[kind] for rows, errors in both.items() if kind in errors} for kind in in_train}
     files = {"model": given.output, "report": given.report}
-    record.add(
+    console.record.add(
         **result.placement.entry(),
-        **entries_by_kind(kinds),
+        **console.entries_by_kind(kinds),
         lengths={length.cause.name: [length.value, length.deviation] for length in result.lengths},
-        leave_one_out={kind: kind_entry(left) for kind, left in result.left_out.items()},
+        leave_one_out={kind: console.kind_entry(left) for kind, left in result.left_out.items()},
         leave_one_out_rms_m=result.left_out.positions_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
@@ -169,8 +170,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             rows[name, f"{errors.count} training"] = errors
             if other is not None:
                 rows[name, f"{other[name].count} held out"] = other[name]
-        out.print(printed.ErrorTable(rows, "by stage", "stage", "rows"))
-        say(*none if held_out is None else [f"no row of this kind {fitted}"] * (other is None))
+        console.out.print(models.ErrorTable(rows, "by stage", "stage", "rows"))
+        console.say(*none if held_out is None else [f"no row of this kind {fitted}"] * (other is None))
         none = []
 
 
@@ -192,18 +193,18 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
-        sizes = ((plain(part.name), part.displacement, part.angle) for part in result.parts)
+        sizes = ((console.plain(part.name), part.displacement, part.angle) for part in result.parts)
         cells = [
             [name, f"{1e3 * shift:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, shift, turn in sizes
         ]
         title = "What explains how much (RMS over the training rows; parts may cancel)"
-        out.print(text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], cells))
-    say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
+        console.out.print(console.text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], cells))
+    console.say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
     if detailed:
         left_out, fitted = result.leave_one_out, result.fit
         if left_out.effective is not None:
-            say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
-        say(
+            console.say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
+        console.say(
             f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
             f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
         )
@@ -214,7 +215,7 @@ POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 def run_demo(given: DemoOptions) -> None:
     """Write an arm and its measurements, and calibrate it by a command that is printed."""
-    make_folder(folder := given.output)
+    console.make_folder(folder := given.output)
     arm = SimulatedArm(seed=given.seed)
     urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
     arm.write_urdf(urdf)
@@ -226,6 +227,112 @@ def run_demo(given: DemoOptions) -> None:
         ["-o", folder / "model.safetensors", "--report", folder / "report.html"],
     ]
     command = [list(map(str, line)) for line in lines]
-    say(f"{given.count} simulated measurements written to {csv}. Now running:\n")
-    say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
+    console.say(f"{given.count} simulated measurements written to {csv}. Now running:\n")
+    console.say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
     app([word for line in command for word in line])
+
+
+MARKERS: dict[str | None, Any] = {None: "evidence", "base": "same", "remounted": "moved", "both": "other"}
+"""Value of --free -> what is assumed of the markers."""
+
+
+def run_recalibrate(given: RecalibrateOptions) -> None:
+    """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
+    if given.output is None:
+        return _compare(given)
+    model = models.load_kinematics(given.old)
+    source = models.table_of(model, given.other, given)
+    how = {"marker": MARKERS[given.free], "seed": given.seed, "note": given.note}
+    console.say(*models.provenance_lines(model), *models.another_date_lines(model))
+    with console.progress_bar() as progress:
+        data = source.read(model.robot)
+        console.say(*repeated_lines(model, data.q))
+        warn_outside_range(model, data.q)
+        result = recalibrate(model, data, progress=progress, **how)
+    save(models.made_by_command(result.model), given.output)  # before anything is printed: output may be cut off
+    after, left_out = result.after, result.left_out
+    kinds = {k: {"before": errors, "after": after[k], "left_out": left_out[k]} for k, errors in result.before.items()}
+    entries = {} if result.moved is None else {"transform": result.moved.transform}
+    entries |= {"rows_can_tell": result.changes.tested, "markers": result.marker, "files": {"model": given.output}}
+    entries |= {"converged": result.fit.converged, "status": result.status}
+    console.record.add(**change_entries(result.changes, result.hidden), **entries, **console.entries_by_kind(kinds))
+    frame = () if result.moved is None else models.frame_lines(result.moved)
+    places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
+    console.say(*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden))
+    console.say(result.fit.status, f"model: {given.output}")
+    if not result.fit.converged:
+        raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _found(result: Recalibration) -> Iterator[str]:
+    """Errors of the new rows, and those that hardly count."""
+    moved, precision = "have moved", ""
+    if result.moved is not None and result.shift is not None:
+        moved = f"are {1e3 * float(result.shift.norm(dim=1).max()):.2g} mm from where they were"
+        precision = f" (these rows show that to {1e3 * result.moved.known_m:.2g} mm)" * result.changes.tested
+    moved += precision + doubt(result.changes, "in this")
+    if not any("markers" in offset.instead for offset in result.hidden):
+        words = {"same": f"are taken to be where they were{precision}", "moved": moved}
+        yield f"the markers {words.get(result.marker, f'{moved}, or are other ones')}"
+    yield f"new rows, RMS from the old model, device and markers found anew: {result.before.rms_text}"
+    yield f"new rows, RMS if each is predicted by the old rows and the other new ones: {result.left_out.rms_text}"
+    if rows := result.outliers:
+        yield f"{len(rows)} row(s) hardly count: row {few(rows)}: measure these poses again"
+
+
+def doubt(changes: Changes, where: str) -> str:
+    """What a change of the robot does to places that were found without one."""
+    if changes.found:
+        return f": a part of the change below is {where}"
+    return "" if changes.tested else f": a change of the robot, which was not tested, would be {where}"
+
+
+def change_entries(changes: Changes, hidden: Sequence[Offset] = ()) -> dict[str, list[dict[str, object]]]:
+    """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
+    smallest = [(offset.joint, offset.size if isfinite(offset.size) else None) for offset in changes.smallest]
+    return {
+        "changes": [
+            {"part": part.part, "size_rad_or_m": part.size, "probability": part.probability, "sentence": str(part)}
+            for part in changes.found
+        ],
+        "smallest_offsets": [{"joint": joint, "size_rad_or_m": size} for joint, size in smallest],
+        "possible_offsets": [
+            {"joint": one.joint, "size_rad_or_m": one.size, "deviation_rad_or_m": one.deviation} for one in hidden
+        ],
+    }
+
+
+def change_lines(changes: Changes, none: object = None) -> list[str]:
+    """Changes, one line each; without one ``none``, and which offsets the rows would have shown."""
+    listed = ", ".join(map(str, changes.smallest))
+    smallest = [f"smallest change of an offset that these rows would show in nine cases of ten: {listed}"]
+    return [f"  {change}" for change in changes.found] or [str(none or changes), *smallest[: len(changes.smallest)]]
+
+
+def _compare(given: RecalibrateOptions) -> None:
+    """Compare a model with new measurements, or with another model."""
+    model, other = models.load_kinematics(given.old), given.other
+    try:
+        with other.open("rb") as file:  # the header of a model is JSON after eight bytes
+            is_model = other.is_file() and file.read(9)[8:] == b"{"
+    except OSError:
+        is_model = other.suffix.lower() not in (".csv", ".txt")
+    if is_model:
+        if given.named or given.length or given.angle:
+            fix = "leave out the options of tables, or name a table"
+            raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
+        rows: Any = models.load_kinematics(other)
+        console.say(*models.provenance_lines(model), *models.provenance_lines(rows))
+    else:
+        source = models.table_of(model, other, given)
+        console.say(*models.provenance_lines(model), *models.another_date_lines(model))
+        rows = source.read(model.robot)
+    compared = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
+    kinds = {kind: {"found": error, "expected": compared.expectations[kind]} for kind, error in compared.errors.items()}
+    moved = {} if compared.moved is None else {"transform": compared.moved.transform}
+    console.record.add(**change_entries(compared.changes, compared.hidden), **moved, **console.entries_by_kind(kinds))
+    console.record.add(rows_can_tell=compared.telling and compared.changes.tested)
+    if compared.moved is not None:
+        console.say(*models.motion_lines(compared.moved, model.on, doubt=doubt(compared.changes, "in them")))
+    console.say(f"RMS from the model, device and markers found anew: {compared.errors.rms_text}")
+    console.say(f"expected of it: {compared.expectations.rms_text}", *change_lines(compared.changes, compared))

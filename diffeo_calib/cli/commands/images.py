@@ -8,9 +8,8 @@ from pathlib import Path
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.cli.console import progress_bar, say
+from diffeo_calib.cli.console import progress_bar, record, say
 from diffeo_calib.cli.declarations import ImagesOptions, RecordOptions
-from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import stated_numbers
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import shown

@@ -14,18 +14,16 @@ from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
 from diffeo_calib.calibration.planning.scene import MARKER
 from diffeo_calib.calibration.planning.sensors import Sensor, sensors_for
-from diffeo_calib.cli.console import out, progress_bar, say, text_table
+from diffeo_calib.cli.console import out, progress_bar, record, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
+from diffeo_calib.cli.models import as_fitted, expectation_lines, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, Candidates
-from diffeo_calib.cli.printed import expectation_lines
-from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import as_written, of_robot, stated_numbers, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.cartesian import SLIDES
 from diffeo_calib.robots.tree import Tree

@@ -21,8 +21,15 @@ from diffeo_calib.common.errors import MeasurementError, few, listed, shown, war
 from diffeo_calib.common.files import as_path
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import POSITIONS, ROTATION_STD, ROTATIONS, STD, Columns, check_count
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.columns import (
+    POSITIONS,
+    ROTATION_STD,
+    ROTATIONS,
+    STD,
+    Columns,
+    PoseColumns,
+    check_count,
+)
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
     CAMERA,

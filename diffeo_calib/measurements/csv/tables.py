@@ -17,8 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, find_columns, number_hint, numbers_in
-from diffeo_calib.measurements.csv.columns import POSITIONS, Body, Column, Columns
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.columns import POSITIONS, Body, Column, Columns, PoseColumns
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, Lines, stated_unit
 from diffeo_calib.measurements.poses import (
     POINTS,

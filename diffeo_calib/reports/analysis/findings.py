@@ -1,9 +1,18 @@
-"""Everything that a report says about a calibration, as numbers: of rows of any kinds, each in its own unit."""
+"""Everything that a report says about a calibration, as numbers: of rows of any kinds, each in its own unit.
+
+Repeats show accuracy and repeatability in the sense of ISO 9283. For one pose with n >= 2 attainments at positions p_j,
+their mean m and the commanded position c,
+
+    accuracy AP = |m - c|,    repeatability RP = mean(l_j) + 3 S_l,   l_j = |p_j - m|,
+
+S_l the standard deviation of l_j. The standard asks for 30 attainments of five poses at full load and speed; fewer are
+reported with their number.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,20 +20,162 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, common_cause, flagged, judge
-from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors
-from diffeo_calib.calibration.result import Part, parts
-from diffeo_calib.common.device import HOST
+from diffeo_calib.calibration.expected_errors import Accuracy, ExpectedError, accuracy, expected_errors
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register_inliers, with_large_offsets
+from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
+from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL, Part, parts
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.interop.rigid import rigid_kinematics, with_errors
+from diffeo_calib.kinematics import evaluation
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import check_rows, place, placement_sentences, positions_of, residuals, unseen
+from diffeo_calib.kinematics.nominal import SessionMarkers
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
-from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions
+from diffeo_calib.sensors.kinds import divided, measured_positions
+
+Kinematics = Callable[[Tensor], Tensor]
+
+
+def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[str, Kinematics]:
+    """The stages of a model's calibration: nominal robot, geometric calibration, and the model itself.
+
+    The first two are calibrated once more from the rows of the fit, which gives the same numbers as then. Where these
+    rows are not known, or stand in several places (models with control points, registered or recalibrated models), base
+    and markers are those that fit the model best.
+    """
+    rows = rows or FitRows(model)
+    mounted_anew = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
+    if not rows.known or mounted_anew or model.registration is not None or model.rigid_errors is None:
+        errors = model.rigid_errors
+        geometric = rigid_kinematics(model) if errors is None else with_errors(model, errors)
+        geometries = with_errors(model, None).geometry, geometric.geometry
+    else:
+        data = rows.measurements
+        with quiet():  # they were shown when the model was fitted
+            registered = with_large_offsets(data, *register_inliers(model.robot, data)).geometry
+            geometries = registered, identify(registered, rows.q, rows.points).geometry
+    return {NOMINAL: geometries[0].points, GEOMETRIC: geometries[1].points, CALIBRATED: model}
+
+
+CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
+"""Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement."""
+
+    q: Tensor  # (M, n) random configurations in these ranges, rad or m
+    deviation: Tensor  # (M,) RMS distance of the markers that the model claims there, m
+    measured: Tensor  # (K, n) configurations of the fit
+    measured_deviation: Tensor  # (K,) the same there, m
+    error: ExpectedError  # what the model expects in all, as every command says it
+
+    # poses that would lower the deviations most, in the order of the moves; None if it is not known what measured
+    next: Plan | None = None
+
+    @classmethod
+    def of(cls, model: CalibratedKinematics) -> Deviations:
+        """The deviations of a model at random configurations."""
+
+        def claimed(q: Tensor) -> Tensor:
+            predicted = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
+            return predicted.claimed.square().mean(1).sqrt().to(HOST)
+
+        fitted = model.configurations.to(HOST)
+        low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
+        draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(0), dtype=low.dtype, device=HOST)
+        q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
+        deviations = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
+        try:
+            somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
+        except InputError:  # a file of an early version
+            return deviations
+        options = [q]
+        try:
+            options += [drawn(model, somewhere, CONFIGURATIONS, model.geometry.tool)] if somewhere else []
+        except InputError:  # such as of a camera, which cannot see everywhere
+            options.append(model.configurations.to(HOST))
+        return replace(deviations, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
+
+
+FEWEST_REPEATS = 5
+"""Measurements beyond the first of every pose from which their deviation says something about the robot."""
+STANDARD_REPEATS = 30  # attainments of every pose that ISO 9283 asks for
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Configurations that were measured several times."""
+
+    lines: Tensor  # (G,) line number of the first measurement of each
+    counts: Tensor  # (G,) measurements of each
+    repeatability: Tensor  # (G,) RP of each, the largest of all markers, m
+    accuracy: Mapping[str, Tensor]  # name of each stage -> (G,) AP of each configuration, the largest of all markers, m
+    deviation: float  # pooled RMS distance of a measurement from the mean of its configuration, unbiased, m
+
+    @property
+    def telling(self) -> bool:
+        """Whether there are enough repeats for one number that speaks of the robot."""
+        return int((self.counts - 1).sum()) >= FEWEST_REPEATS
+
+
+def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: float) -> Repeats | None:
+    """Accuracy and repeatability of the configurations that rows repeat; None if no row does.
+
+    Rows that differ so much that the robot moves by more than the noise are neighbours, not repeats. Exact copies of a
+    row, which no measurement gives, count once.
+
+    Args:
+        data: the rows. stages: name -> kinematics, the best one last. noise: of one measured coordinate, m.
+    """
+    copies = {row for _, row in data.copies()}
+    data = data.rows([row for row in range(len(data)) if row not in copies])
+    labels = data.groups()
+    repeated = torch.bincount(labels)[labels] > 1
+    if not bool(repeated.any()):
+        return None
+    data = data.rows(repeated)
+    at_rows = {name: evaluation.at_payloads(kinematics, data)(data.q).detach() for name, kinematics in stages.items()}
+    predicted = {name: data.bodies.origins(at) for name, at in at_rows.items()}  # (N, B, 3) m
+    *_, best = predicted.values()
+    points, labels, squares, freedom = data.origins, data.groups(), 0.0, 0
+    first, counts, repeatability = list[int](), list[int](), list[Tensor]()
+    accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
+    for label in labels.unique().tolist():
+        rows = (labels == label).nonzero()[:, 0]
+        middle = points[rows].nanmean(0)
+        distances = (points[rows] - middle).norm(dim=-1)  # (n, B), NaN for hidden markers
+        attained = (~distances.isnan()).sum(0)
+        if int(attained.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
+            continue
+        variances = (distances - distances.nanmean(0)).square().nansum(0) / (attained - 1).clamp(min=1)
+        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[attained > 1].max())
+        squares += float(distances.square().nansum())
+        freedom += int((attained - 1).clamp(min=0).sum())
+        first.append(int(rows[0]))
+        counts.append(len(rows))
+        for name, places in predicted.items():
+            accuracy[name].append(largest_known((middle - places[rows].mean(0)).norm(dim=-1), 0))
+    if not first:
+        return None
+    return Repeats(
+        data.line_numbers[first],
+        torch.tensor(counts, dtype=torch.int64, device=HOST),
+        torch.stack(repeatability),
+        {name: torch.stack(values) for name, values in accuracy.items()},
+        (squares / freedom) ** 0.5,
+    )
+
 
 LOG = logging.getLogger(__name__)
 STEPS = 4  # of the analysis, as they are told
@@ -138,9 +289,11 @@ def find(
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if data is not None:
-        check_rows(model, data)
-    placed = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
-    measured = None if data is None else positions_of(model, placed, data)
+        evaluation.check_rows(model, data)
+    placed = (
+        Places() if data is None else evaluation.place(model, data) if places is None else list(places.values())[-1]
+    )
+    measured = None if data is None else evaluation.positions_of(model, placed, data)
     if measured is not None and measured.markers != model.markers:
         fix = "pass the markers that the model predicts, in the same order"
         raise InputError.of("the markers of `data`", expected=model.markers, got=measured.markers, fix=fix)
@@ -173,7 +326,7 @@ def find(
         columns=columns,
         expected=expected_errors(model, kinematics, deviations.error),
         deviations=deviations,
-        devices=[*shown.pop("devices", ()), *placement_sentences(model)],
+        devices=[*shown.pop("devices", ()), *evaluation.placement_sentences(model)],
         **shown,
     )
 
@@ -184,7 +337,7 @@ NOTHING: dict[str, Any] = {"kinds": {}, "new": False, "predictions": None, "outl
 
 def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     """(N,) which rows took no part in the fit, nor in a registration: those of other kinds than its rows never did."""
-    new = unseen(model, data.q)
+    new = evaluation.unseen(model, data.q)
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
         positions = divided(data)[0]
@@ -222,13 +375,13 @@ def _of_table(
     alone = of_positions and measured is not None and len(measured) == len(data)
     for name in before:
         rows = measured if alone else data
-        at = place(stages[name], rows) if alone or places is None else places[name]
+        at = evaluation.place(stages[name], rows) if alone or places is None else places[name]
         at = at if alone else replace(at, devices={**placed.devices, **at.devices}, ball=placed.ball)
-        errors[name] = residuals(stages[name], at, rows).rows(mask)
-    errors[last] = residuals(stages[last], placed, data).rows(mask)
+        errors[name] = evaluation.residuals(stages[name], at, rows).rows(mask)
+    errors[last] = evaluation.residuals(stages[last], placed, data).rows(mask)
     shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask]), "new": new, "devices": placed.found}
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
-    if measured is None or raw is None or not new or not bool((fresh := unseen(model, raw.q)).any()):
+    if measured is None or raw is None or not new or not bool((fresh := evaluation.unseen(model, raw.q)).any()):
         return shown
     judged = judge(model, placed, data.rows(mask), errors[last])
     moved = judged.causes if judged.refusal is None else [judged.refusal]
@@ -246,7 +399,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     predicted = Predictions.of_fit(rows)
     LOG.info("judged by the %d rows of the fit, each predicted by all others", len(predicted))
     data, (*before, last) = predicted.data, stages
-    errors = {name: residuals(stages[name], place(stages[name], data), data) for name in before}
+    errors = {name: evaluation.residuals(stages[name], evaluation.place(stages[name], data), data) for name in before}
     errors[last] = Evaluations.of([(predicted.errors, torch.arange(len(predicted), device=HOST))])
     outliers = predicted.outliers(model)
     wrong = flagged(len(data), outliers)

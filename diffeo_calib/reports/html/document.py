@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
 
-from diffeo_calib.reports.plots import style
+from diffeo_calib.reports.plots import panels as style
 from diffeo_calib.reports.plots.panels import joint_label, joint_values
 from diffeo_calib.robots.tree import Tree
 
