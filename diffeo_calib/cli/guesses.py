@@ -381,6 +381,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         there = (text for text, names in devices.items() if all("" in sheet.cells[name] for name in names))
         readings = [*corners, *there]
     bodies = bodies or ([] if sockets or readings else _numbered(others))
+    less = in_other_units(sheet, bodies)
+    left += [f"{few(bodies[k].place)}: {words}" for k, words in less.items()]
+    bodies = [body for k, body in enumerate(bodies) if k not in less]
     if not bodies and not sockets and not readings:
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
         fix = f"if they are in another file: --places FILE --by {common}; without a tracker: columns `place` and "

@@ -282,10 +282,9 @@ def with_measured(source: Source) -> Source:
         why = "names the marker of each line: the first line alone of every pose holds its joint values"
         return source.into({"marker": why}, marker=names)
     several, tips = len(source.bodies) > 1, source.options.tip or ()
-    copies, counted = guesses.in_other_units(source.sheet, source.bodies), "(counted from 0)"
     of_each = (unmeasured_markers(source.robot, rows) for _, rows in source.positions() if several)
-    proved = ({marker: f"{words} {counted}" for marker, words, sure in every if sure} for every in of_each)
-    copies = copies or next(filter(None, proved), dict[int, str]())
+    proved = ({marker: words for marker, words, sure in every if sure} for every in of_each)
+    copies = next(filter(None, proved), dict[int, str]())
     if several and not copies and len(tips) < 2:  # perhaps in units of their own
         alone = [replace(source, bodies=[own]).into(position=[own.written("")]).units[0].left for own in source.bodies]
         far = max(alone)
@@ -294,7 +293,7 @@ def with_measured(source: Source) -> Source:
                 copies[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
     if copies:
         kept = [k for k in range(len(source.bodies)) if k not in copies]
-        left = [f"{few(source.bodies[k].place)}: {words}; not used" for k, words in copies.items()]
+        left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in copies.items()]
         source = replace(source, bodies=[source.bodies[k] for k in kept]).remarking(*left)
         why = f"{len(kept)} marker(s), by their names"
         source = source.into({"position": why}, position=[body.written() for body in source.bodies])
