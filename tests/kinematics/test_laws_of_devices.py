@@ -319,13 +319,13 @@ def test_increments_are_what_steps_do_to_the_rows(kind: type[SetUps]) -> None:
 @pytest.mark.parametrize("kind", [MeasuringFrames, MountedMarkers])
 def test_carried_set_ups_belong_to_the_other_model(kind: type[SetUps]) -> None:
     T, own = frames(1, 11, 1.0)[0], found(kind)
-    tips, none = T @ TIPS, torch.zeros(3, 3, dtype=torch.float64)
-    constants = own.carried(T, points(TIPS), points(tips), none)
+    tips, shifts = T @ TIPS, 0.01 * normal(3, 3, seed=13) * (kind is MountedMarkers)  # elsewhere on the other's tool
+    constants = own.carried(T, points(TIPS), points(tips), shifts)
     other = replace(own, constants=constants, turns=found(kind, tips).turns if kind is MountedMarkers else None)
     data = measured(kind)
     if kind is not MeasuringFrames:  # what is on the tool goes with the device
         data = with_attributes(data, points=data.points @ T[:3, :3].mT + T[:3, 3])
-    assert_close(other.aligned(data).points, points(tips), rtol=0, atol=1e-9)
+    assert_close(other.aligned(data).points, points(tips) - shifts @ tips[:, :3, :3].mT, rtol=0, atol=1e-9)
 
 
 def test_the_deviations_of_markers_are_those_of_means() -> None:
