@@ -17,20 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import product_bank
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
-from product_bank import (
-    Case,
-    calibrated,
-    calibrated_poses,
-    sliding_measurements,
-    sliding_robot,
-    ur10_measurements,
-    ur10_scales,
-    usual_scales,
-    with_usual_scales,
-)
+from product_bank import Case, calibrated, ur10_measurements, ur10_scales, usual_scales, with_usual_scales
 from shared_bank import begin, shared
 
 import diffeo_calib as dc
@@ -53,14 +44,14 @@ def pair() -> Case:
 @pytest.fixture(scope="session")
 def posed() -> Case:
     """The simulated arm, calibrated with 30 poses of a frame on its tool."""
-    return shared("posed", lambda: calibrated_poses(30))
+    return shared("posed", lambda: product_bank.calibrated_poses(30))
 
 
 @pytest.fixture(scope="session")
 def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
-    robot = sliding_robot()
-    train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
+    robot = product_bank.sliding_robot()
+    train, test = product_bank.sliding_measurements(robot, 50), product_bank.sliding_measurements(robot, 300, seed=1)
     scales = usual_scales(robot).inflated(2.0)
     return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
 
@@ -107,7 +98,7 @@ LONGEST = (
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
     *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_tool.py", "test_rigid.py"),
     *("test_plan.py", "test_json_results.py"),
-    *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
+    *("test_distributed.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
     *("test_second_device.py", "test_fit.py"),
     *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_set_ups.py"),

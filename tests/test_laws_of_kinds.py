@@ -16,17 +16,13 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
-    pytest.mark.slow,
-]
+pytestmark = pytest.mark.slow, pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 Lines = dict[tuple[str, int], tuple[str, Tensor]]
 Law = Callable[[Kind, Any], Any]
 
 
 def lines(model: Any, rows: Any) -> Lines:
-    """Kind and line of every row -> name of its device, and its errors."""
     found: Any = dc.evaluate(model, rows)
     each = {}
     for one in found.values() if isinstance(found, Mapping) else [found]:
@@ -76,7 +72,6 @@ def test_a_model_is_saved_whole(kind: str) -> None:
 
 
 def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
-    """Of positions beside rows in sockets, whose places move along."""
     kind, T = kind_named("mixture"), twist_transform(ELSEWHERE)
     parts: Any = kind.data.parts
     measured, others = ([part for part in parts if part.without_device is free] for free in (False, True))
@@ -87,19 +82,16 @@ def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
         assert_close(there, own @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
 
 
-def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, Any, Any]:
-    """Positions, and distances of devices with and without a known zero."""
+def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, ...]:
     arm = SimulatedArm(0, markers=2)
     q, points = arm.measure(40, seed=5)
     tables = [reading_bank.readings(arm, "distance", 48, zero, noise=2e-5, seed=3 + bool(zero)) for zero in (0.0, 0.03)]
-    named = [
-        replace(own, names=tuple(f"{name} {number}" for number in range(3)))
-        for own, name in zip(tables, (first, second), strict=True)
-    ]
-    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), named[0], named[1]
+    names = [tuple(f"{name} {number}" for number in range(3)) for name in (first, second)]
+    both = [replace(own, names=each) for own, each in zip(tables, names, strict=True)]
+    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), *both
 
 
-def test_devices_with_and_without_a_known_zero_are_all_known_to_the_model() -> None:
+def test_devices_with_and_without_a_known_zero() -> None:
     tables = wires()
     data = dc.Observations.joined(tables)
     model = dc.calibrate(SimulatedArm(0).nominal, data, hyperparameters=reading_bank.scales()).model  # pyright: ignore
@@ -111,14 +103,8 @@ def test_devices_with_and_without_a_known_zero_are_all_known_to_the_model() -> N
     found: Any = dc.evaluate(again, data)
     assert found.numbers == 0
     assert max(one.rms for one in found.values()) < 1e-4
-
-
-def test_one_name_for_devices_of_one_kind_that_read_in_two_ways_is_refused() -> None:
     with pytest.raises(dc.DiffeoCalibError, match=r"distances of 'wire 0', .*'wire 1'.*name"):
         dc.Observations.joined(wires("wire", "wire"))
-
-
-def test_known_deviations_of_a_part_of_the_readings_of_a_device_are_refused() -> None:
     _, own, _ = wires()
     known = replace(own, std=torch.full_like(own.values, 1e-5))
     with pytest.raises(dc.DiffeoCalibError, match=r"wire 0.*deviations"):
@@ -201,7 +187,6 @@ def test_rows_that_are_all_alone_in_their_sockets_are_refused(verb: Callable[[An
 
 @pytest.mark.parametrize("name", ["several kinds", "inclinations", "images and a tracker"])
 def test_devices_are_kept_where_positions_alone_are_registered(name: str) -> None:
-    """Twice, by another device each time, and beside it again."""
     kind = kind_named(name)
     model, before = kind.model, dc.evaluate(kind.model, kind.new)
     names = [own.names for own in model.placement]
@@ -233,9 +218,7 @@ def test_a_marker_in_place_of_the_ball_makes_a_model_forget_its_gauges() -> None
 def test_poses_of_another_mounting_are_warned_about(on_tool: bool) -> None:
     kinds = [kind_named(name) for name in ("poses", "camera on the tool")]
     own, other = kinds if on_tool else kinds[::-1]
-    with pytest.warns(
-        dc.DiffeoCalibWarning, match=r"not those of a calibrated robot: expected a median of about 0\.\d"
-    ):
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"not those of a calibrated robot: expected a median of"):
         dc.evaluate(own.model, other.new)
 
 
@@ -257,7 +240,6 @@ def test_set_ups_of_the_fit_stay_where_it_found_them(name: str) -> None:
 
 
 def wrong_rows(model: Any, rows: Any, **options: Any) -> tuple[int, ...]:
-    """Numbers of the rows that a registration leaves out."""
     found = model.registered(rows.with_line_numbers(torch.arange(len(rows))), **options).registration
     assert found is not None
     return found.outliers
@@ -294,8 +276,7 @@ def test_a_lens_that_is_known_poorly_hardly_moves_the_frame() -> None:
     (errors,) = rows.shared_errors()
     shift = (errors.slopes @ torch.ones(errors.slopes.shape[2], dtype=torch.float64)).view_as(rows.points)
     assert float(shift.abs().max()) > 1e-3
-    before, after = (
-        kind.model.registered(one, learn=False) for one in (rows, with_attributes(rows, points=rows.points + shift))
-    )
+    both = rows, with_attributes(rows, points=rows.points + shift)
+    before, after = (kind.model.registered(one, learn=False) for one in both)
     assert_close(after(kind.q(20)), before(kind.q(20)), rtol=0, atol=5e-5)
     assert after.registration.outliers == ()

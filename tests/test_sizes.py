@@ -19,11 +19,8 @@ MOST_LINES, MOST_CODE_LINES, MOST_PARAMETERS = 500, 60, 8
 SIZES = Path(__file__).with_name("sizes.json")
 """Name of each folder of the package, "root" and "total" -> its lines at most."""
 
-FILES = sorted(
-    path
-    for folder in ("diffeo_calib", "tests", "benchmarks", "scripts")
-    for path in (REPOSITORY / folder).rglob("*.py")
-)
+FOLDERS = "diffeo_calib", "tests", "benchmarks", "scripts"
+FILES = sorted(path for folder in FOLDERS for path in (REPOSITORY / folder).rglob("*.py"))
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 

@@ -129,9 +129,7 @@ def kind_entry(errors: Evaluation, *, metres: bool = False) -> dict[str, object]
 
 def entries_by_kind(errors: Mapping[str, Any]) -> dict[str, Any]:
     """Errors of every kind of rows as ``kinds``; those of measured positions once more as ``errors``, in m.
-
-    Args:
-        errors: kind -> errors, or errors by rows and by stage.
+    errors: kind -> errors, or errors by rows and by stage.
     """
     entries: dict[str, Any] = {"kinds": _each(errors, kind_entry), "errors": {}}
     for stages in errors.values():
@@ -144,7 +142,6 @@ def entries_by_kind(errors: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _each(errors: Any, entry: Callable[[Evaluation], dict[str, Any]]) -> Any:
-    """The entry of every evaluation of a tree."""
     return {name: _each(part, entry) for name, part in errors.items()} if isinstance(errors, Mapping) else entry(errors)
 
 
@@ -165,10 +162,8 @@ def check_outputs(named: dict[str, Path], inputs: dict[str, Path], *, may_come: 
     """Refuse files that cannot be written, that are also read, or that are named twice.
 
     --json is one of the files. Files that are read must exist, which is known at once, before anything is loaded.
-
-    Args:
-        named: option -> file to write. inputs: name of an argument -> file that is read.
-        may_come: names of files that may not exist yet.
+    named: option -> file to write. inputs: name of an argument -> file that is read.
+    may_come: names of files that may not exist yet.
     """
     wanted, record.path = record.path, None  # nothing is written there before the place has been checked
     if wanted is not None:

@@ -33,7 +33,6 @@ SAME_SHARE = 1e-3  # of the largest number, by which digits of one place in two 
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
-
 DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
 NAMED = {
     "session": ("session setup station anchor device plane", "the device, or its set-up, of every row"),
@@ -47,22 +46,12 @@ JOINTS = "q0", "q1"
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
 ROTATIONS = (
-    (("qx", "qy", "qz", "qw"), "a quaternion"),
-    (("x", "y", "z", "w"), "a quaternion"),
-    (("q0", "q1", "q2", "q3"), "a quaternion, usually the real part first (quat_wxyz)"),
-    (("q1", "q2", "q3", "q4"), "a quaternion, usually the real part first (quat_wxyz)"),
-    *((tuple(f"{row}{k}" for row in index for k in index), "a matrix by rows") for index in ("012", "123")),
-    (("rx", "ry", "rz"), "a rotation vector, or angles about x, y and z"),
-    (("x", "y", "z"), "a rotation vector, or angles about x, y and z"),
-    (("roll", "pitch", "yaw"), "angles about fixed x, y and z (xyz)"),
-    (("a", "b", "c"), "angles of KUKA: ZYX in deg"),
-    (("w", "p", "r"), "angles of Fanuc: xyz in deg"),
-    (("o", "a", "t"), "angles of Kawasaki: ZYZ in deg"),
-    (("euler1", "euler2", "euler3"), "Euler angles"),
-    (("alpha", "beta", "gamma"), "Euler angles"),
-    (("phi", "theta", "psi"), "Euler angles"),
+    *(("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"), ("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")),
+    *(tuple(f"{row}{k}" for row in index for k in index) for index in ("012", "123")),  # a matrix by rows
+    *(("rx", "ry", "rz"), ("x", "y", "z"), ("roll", "pitch", "yaw"), ("a", "b", "c"), ("w", "p", "r"), ("o", "a", "t")),
+    *(("euler1", "euler2", "euler3"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi")),
 )
-"""Labels of the columns of a rotation, and what is usually written with them."""
+"""Labels of the columns of a rotation: quaternions, matrices, rotation vectors and angles, by robots' makers too."""
 ENTRIES = [[row + k for row in index for k in index] for index in ("0123", "1234")]
 ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:12] for labels in ENTRIES]
 """Labels of the 16 numbers of a pose as a matrix: by row and column, without the last row too, or counted."""
@@ -204,7 +193,6 @@ def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tupl
 
 
 def _is_external(name: str) -> bool:
-    """Whether a name is that of an axis beside those of the arm, such as E1 or rail."""
     return bool({*column(name).words} & WORDS["external"])
 
 
@@ -220,7 +208,6 @@ class Body(NamedTuple):
 
     place: list[str]
     turn: list[str]
-    usual: str = ""  # what such names of a rotation usually mean
     left: str = ""  # what the place is, if no device measured it
     spherical: tuple[str, ...] = ()  # how the place may be written, if it is a distance and two angles
 
@@ -242,25 +229,25 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     """
     at = {name: offset for offset, name in enumerate(columns)}
     places = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
-    turns = [(group, usual) for labels, usual in ROTATIONS for group in _rotations(columns, labels)]
-    pairs = list[tuple[tuple[int, ...], str, list[str], str]]()
-    for place, (rank, (group, usual)) in product(places, enumerate(turns)):
+    turns = [group for labels in ROTATIONS for group in _rotations(columns, labels)]
+    pairs = list[tuple[tuple[int, ...], str, list[str]]]()
+    for place, (rank, group) in product(places, enumerate(turns)):
         first, turn = place.names["x"], list(group.names.values())
         unlike = (group.shared - group.says("turn", "place")) ^ ({*column(first).words} - {"x", *WORDS["place"]})
         start = min(at[name] for name in turn)
         series = turn[0] in JOINTS and start < at[first]  # of joints, rather than a quaternion
         if place.wished == group.wished and not series:
-            pairs.append(((len(unlike), abs(start - at[first]), at[first], start, rank), first, turn, usual))
-    rotations = dict[str, tuple[list[str], str]]()
-    for _, first, turn, usual in sorted(pairs):
-        if first not in rotations and not any(set(turn) & set(other) for other, _ in rotations.values()):
-            rotations[first] = turn, usual
+            pairs.append(((len(unlike), abs(start - at[first]), at[first], start, rank), first, turn))
+    rotations = dict[str, list[str]]()
+    for _, first, turn in sorted(pairs):
+        if first not in rotations and not any(set(turn) & set(other) for other in rotations.values()):
+            rotations[first] = turn
     bodies = list[Body]()
     for place in sorted(places, key=lambda place: at[place.names["x"]]):
         better = [twin.names["x"] for twin in places if twin.stem == place.stem and twin.rank < place.rank]
         left = f"places beside the measured ones of {better[0]}" if better else ""
         names, left = list(place.names.values()), "wished places" if place.wished else left
-        bodies.append(Body(names, *rotations.get(names[0], ([], "")), left=left))
+        bodies.append(Body(names, rotations.get(names[0], []), left))
     return bodies
 
 
@@ -371,6 +358,14 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [body for body in places if not body.left]
     bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others)
+    if {f"{axis}{k}" for axis in "uv" for k in "1234"} <= {column(name).plain for name in others}:
+        expected, fix = (
+            f"a line for each, with {few([IMAGE, *POINT, *PIXEL])}",
+            "split the lines, as `images` writes them",
+        )
+        raise InputError.of(
+            f"corners in '{sheet.path}'", expected=expected, got="u1, v1, u2, v2, ... in a line", fix=fix
+        )
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [group for group in whole(others, "xy") if not (group.wished or group.says("rate", "deviation"))]
         bodies = [Body([*group.names.values(), ZERO], []) for group in flat]
@@ -384,6 +379,10 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     less = in_other_units(sheet, bodies)
     left += [f"{few(bodies[k].place)}: {words}" for k, words in less.items()]
     bodies = [body for k, body in enumerate(bodies) if k not in less]
+    if not bodies and not sockets and not readings:  # one column of names that repeat, such as A1, B2
+        texts = [name for name in sheet.header if name not in joints and name not in sheet.numbers]
+        named = [name for name in texts if 1 < len({*sheet.cells[name]}) <= len(sheet.cells[name]) / 2]
+        sockets = named * (len(named) == 1)
     if not bodies and not sockets and not readings:
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
         fix = f"if they are in another file: --places FILE --by {common}; without a tracker: columns `place` and "
@@ -406,7 +405,6 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
 
 
 def _of_readings(texts: Sequence[str]) -> str:
-    """Why readings are taken, and what is left to the user."""
     why = "by names; `displacement` is a distance with an unknown zero"
     if any(text.endswith(LENS) for text in texts):
         why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
@@ -440,7 +438,7 @@ def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
             by_rows = all(number(cell, sheet.decimal) == 0 for cell in below)
             entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
             turn = [name for row in entries for name in row[:3]]
-            bodies.append(Body([row[3] for row in entries], turn, "a matrix"))
+            bodies.append(Body([row[3] for row in entries], turn))
     return bodies
 
 

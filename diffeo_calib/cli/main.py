@@ -9,15 +9,8 @@ written).
 Each command imports its work when it runs, so that help, the version and shell completion load neither torch nor SciPy
 and appear at once.
 
-Campaign files hold options so that they are written once:
-
-    csv = "measurements.csv"            robot = "robot.urdf"
-    base = "base_link"                  tip = "flange"
-    position = ["x,y,z"]                length = "mm"
-    angle = "deg"                       output = "robot.safetensors"
-
-`diffeo-calib fit campaign.toml` runs as if the options had been typed. Options that are typed as well win,
-also those that may be repeated, such as `--tip`. Paths are relative to the folder of the file.
+Campaign files hold options, `tip = "flange"`: `diffeo-calib fit campaign.toml` runs as if they had been typed. Options
+that are typed as well win, also those that may be repeated, such as `--tip`. Paths are relative to the file's folder.
 """
 
 from __future__ import annotations
@@ -63,12 +56,9 @@ SUFFIX = ".toml"
 COMMAND, LIVE = "fit", "campaign"
 JOINED = ("rotation-std",)  # entries that may be lists of columns although the option can be repeated
 LONGEST_FILE = 1 << 20  # bytes: a file of options is short
-IN_FILE_OF = {
-    "record": "images",
-    "demo": "fit",
-    "recalibrate": "fit",
-    "predict": "evaluate",
-}  # command -> that whose file holds its work
+IN_FILE_OF = {"record": "images", **dict.fromkeys(("demo", "recalibrate"), "fit")}
+IN_FILE_OF |= {"export": "correct", **dict.fromkeys(("predict", "plan"), "evaluate")}
+"""Command -> that whose file holds its work."""
 GONE = {
     "compare": "write `recalibrate OLD OTHER` without -o",
     "report": "write `evaluate MODEL [CSV] --report PAGE`",
@@ -151,7 +141,6 @@ app = typer.Typer(
 
 
 def _remember(path: Path | None) -> Path | None:
-    """The command writes its results to this file when it ends."""
     if path is not None:
         record.path = path
         check_outputs({}, {})
@@ -171,7 +160,6 @@ Json = Annotated[
 
 
 def _declare(name: str, options: type[Command]) -> None:
-    """Declare a command by the class of its options; every command has --json."""
     declared = sorted(options.all(), key=lambda option: bool(option.names))  # arguments first, in messages too
     parameters = list[inspect.Parameter]()
     named = {word: option.hint for option in declared for word in option.names or (option.shown,)} | {"--json": Path}
@@ -276,7 +264,6 @@ def _entries(path: Path) -> dict[str, Any]:
 
 
 def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
-    """One entry as words of a command line."""
     if isinstance(value, bool):
         return [f"--{name}"] * value
     values = value if isinstance(value, list) else [value]

@@ -113,10 +113,10 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
 
 
-def as_fitted(model: CalibratedKinematics, given: Given) -> Given:
-    """Options of a command with a model, completed by those of the command that made it."""
+def as_fitted(model: CalibratedKinematics, given: Given, csv: Path | None = None) -> Given:
+    """Options of a command with a model, completed by those of the command that made it, see :func:`as_at_the_fit`."""
     made = model.provenance
-    given = as_at_the_fit("" if made is None else made.command or made.table, given)
+    given = as_at_the_fit("" if made is None else made.command or made.table, given, csv)
     unit = given.joint_length or given.length
     if made is not None and made.program_rows and unit and PROGRAM in (given.robot_pose or ""):
         PoseColumns.of(given.robot_pose or "").check_program(made.program_rows, UNITS_PER_METRE[unit])
@@ -125,7 +125,7 @@ def as_fitted(model: CalibratedKinematics, given: Given) -> Given:
 
 def table_of(model: CalibratedKinematics, csv: Path, given: Rows) -> MeasuredTable:
     """A table read as that of the model's fit unless options say otherwise, without kinds of rows that it lacks."""
-    rows = as_fitted(model, given)
+    rows = as_fitted(model, given, csv)
     if not given.named:
         rows, missing = rows_in_table(csv, rows)
         if missing:
@@ -161,7 +161,6 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
 
 LONGEST_TOOL_PER_REACH = 5.0  # from where a tool is refused: its unit is wrong
 
-
 MEASURED = "measured:"  # before the numbers of a tool in the measured frame
 
 
@@ -195,18 +194,15 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, table: TableForma
     return on_tip[0] @ tool
 
 
-WIDEST = 1000  # characters of the widest table
 EXIT_ABOVE = 4  # the errors are larger than --tolerance
 UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "m": ("m", 1.0), "px": ("px", 1.0)}
 """Unit of a limit -> unit in which it is compared, and how many are one of these; own kinds of readings have others."""
 
 
 class ErrorTable:
-    """Errors in their own unit, and of orientations in degrees if there are any; in two tables where one is too wide.
-
-    Args:
-        rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
-        columns: names of the leading columns. expected: RMS, m, in a column of its own.
+    """Errors in their own unit, and of orientations in degrees, in a second table, if there are any.
+    rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
+    columns: names of the leading columns. expected: RMS, m, in a column of its own.
     """
 
     def __init__(
@@ -214,27 +210,19 @@ class ErrorTable:
     ) -> None:
         self.rows, self.of, self.columns, self.expected = rows, of, columns, expected
 
-    def _table(self, title: str, *, errors: bool = True, angles: bool) -> Table:
-        """A table of errors, those of orientations, or both."""
-        last = [self.expected] if self.expected is not None and errors else []
-        header = [*self.columns, *SIZES * errors, *[f"{size} deg" for size in SIZES] * angles]
-        lines = list[list[str]]()
+    def _table(self, title: str, *, angles: bool = False) -> Table:
+        last = [self.expected] if self.expected is not None and not angles else []
+        header, lines = [*self.columns, *([f"{size} deg" for size in SIZES] if angles else SIZES)], list[list[str]]()
         for labels, row in self.rows.items():
-            each = row.each[not errors : 1 + angles]
-            numbers = [*(size for part in each for size in part.sizes), *(row.shown[1] * value for value in last)]
+            numbers = [*row.each[angles].sizes, *(row.shown[1] * value for value in last)]
             lines.append([*labels, *("-" if isnan(value) else f"{value:.4f}" for value in numbers)])
         return text_table(title, [*header, *["expected RMS"] * len(last)], lines, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         first = next(iter(self.rows.values()))
-        title, turned = f"{first.title} in {first.shown[0]} {self.of}", first.orientation is not None
-        whole = self._table(title + ", orientation errors in deg" * turned, angles=turned)
-        wide = options.update(max_width=WIDEST)
-        if not turned or console.measure(whole, options=wide).maximum <= options.max_width:
-            yield whole
-        else:
-            yield self._table(title, angles=False)
-            yield self._table(f"Orientation errors in deg {self.of}", errors=False, angles=True)
+        yield self._table(f"{first.title} in {first.shown[0]} {self.of}")
+        if first.orientation is not None:
+            yield self._table(f"Orientation errors in deg {self.of}", angles=True)
 
 
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -311,8 +311,7 @@ def with_measured(source: Source) -> Source:
 
 def with_units(source: Source) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
-
-    InputError for none of them, or several; MeasurementError for rows that calibrate nothing.
+    InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
     periodic, why, ways = source.robot.periodic, "", source.units
     if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):
@@ -392,7 +391,6 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
 
 def _with_meanings(best: Source) -> Source:
     """With units and `joints` with which the robot explains positions; in the best units as they are if there are none.
-
     Of several places each alone too: the robot's own may be beside the measured ones.
     """
     if best.options.socket or best.options.reading:
@@ -437,9 +435,8 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual = " or ".join(dict.fromkeys(body.usual for body in turned))
         names = [name for body in turned for name in body.turn]
-        remark = f"{few(names, 9)}: {what}; not used; such names usually mean {usual}"
+        remark = f"{few(names, 9)}: {what}; not used"
         return source if camera else source.remarking(remark)
     why = {"convention": reason(*ways)}
     if camera:

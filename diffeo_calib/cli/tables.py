@@ -108,17 +108,17 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, given: Given) -> Given:
+def as_at_the_fit(command: str, given: Given, csv: Path | None = None) -> Given:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
-    unless both --length and --angle are.
-
-    Args:
-        command: that made the model, or the options of its table alone; empty where neither is known.
+    unless both --length and --angle are. Marks are then those of the fit too if the file has more columns with them.
+    command: that made the model, or the options of its table alone; empty where neither is known. csv: the file.
     """
     wanted, marker = given.left_open(), given.marker if isinstance(given, Rows) else None
     wanted -= {name for name, value in vars(given).items() if value}
+    if csv is not None and csv.is_file() and not given.sep and "sep" not in wanted:
+        wanted |= _marks_of_fit(command, given, csv)
     try:
         stored = shlex.split(command) if wanted or marker else []
         if marker is not None and "=" not in marker:
@@ -139,6 +139,16 @@ def as_at_the_fit(command: str, given: Given) -> Given:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
     return replace(given, **{name: value for name, (value, _) in stated.items()})
+
+
+def _marks_of_fit(command: str, given: Units, csv: Path) -> set[str]:
+    """Names of the marks that a file shares with the table of the fit: it has more columns with them."""
+    with suppress(ValueError, IndexError, InputError):
+        marks = _stated(shlex.split(command), {"sep"} if given.decimal else {"sep", "decimal"})
+        like = replace(given, **{name: value for name, (value, _) in marks.items()})
+        widths = [len(CsvLines(csv, table_format(units).sep).header) for units in (given, like)]
+        return {*marks} if widths[1] > widths[0] else set()
+    return set()
 
 
 def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:

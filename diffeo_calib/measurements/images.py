@@ -32,7 +32,6 @@ ONLY_CAMERA = "camera"  # name of a camera that is alone
 MOVED = 1e-3  # of a pose from that in its image, m and rad, from which a row is in another frame
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
-
 ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
 
 

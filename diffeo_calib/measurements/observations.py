@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
+from diffeo_calib.measurements.checks import chosen_rows, numbers_of
 from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
 
 WITH_POSITION = ("position", "pose")  # kinds of rows of which a device measures positions
@@ -30,7 +30,6 @@ def _in_order(values: Sequence[Any], index: Sequence[Tensor]) -> Any:
 
 
 def _column(name: str) -> Any:
-    """What :class:`RowGroups` says of each row, of all parts."""
     return property(lambda data: _in_order([getattr(part, name) for part in data.parts], data.index))
 
 
@@ -41,11 +40,9 @@ NUMBERED = "device_names", "row_names", "places", "socket_numbers"
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Observations(RowGroups):
     """N rows of several kinds, made by :meth:`joined`.
-
-    Args:
-        parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
-            order of their first rows.
-        index: (N_i,) int64 for each part, its row numbers here.
+    parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
+        order of their first rows.
+    index: (N_i,) int64 for each part, its row numbers here.
 
     Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload, covariates,
     device_names, places and socket_numbers hold the values of all rows. A line of a file that holds observations of
@@ -72,13 +69,6 @@ class Observations(RowGroups):
         """The rows of several tables in order, see :meth:`Measurements.joined`."""
         return joined_tables(parts, apart=True)
 
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the file that the rows were read from, or of the parts."""
-        rows = {f"index {k}": numbers for k, numbers in enumerate(self.index)}
-        parts = {f"part {k}": part.sha256.encode() for k, part in enumerate(self.parts)}
-        return self.file_sha256 or arrays_sha256(rows, parts)
-
     device_names, row_names, places, socket_numbers = map(_column, NUMBERED)
 
     @property
@@ -102,11 +92,6 @@ class Observations(RowGroups):
         """Whether neither a position nor a pose was measured."""
         return not any(part.kind in WITH_POSITION for part in self.parts)
 
-    def __repr__(self) -> str:
-        counts = (len(self), "row"), (self.n, "joint")
-        words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-        return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
-
     def to_frame(self) -> Any:
         """See :meth:`RowGroups.to_frame`; the first column is kind, and cells of other kinds are NaN."""
         frames = [part.to_frame() for part in self.parts]
@@ -117,7 +102,6 @@ class Observations(RowGroups):
         return whole
 
     def rows(self, index: object) -> Observations:
-        """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         parts, numbers = [], []
         for part, whole in zip(self.parts, self.index, strict=True):
@@ -130,7 +114,6 @@ class Observations(RowGroups):
         return Observations(parts, numbers)
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Observations:
-        """See :class:`RowGroups`."""
         pairs = zip(self.parts, self.index, strict=True)
         return Observations([change(part, rows) for part, rows in pairs], self.index)
 
@@ -155,9 +138,7 @@ def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
     These are rows with the same columns; rows of several kinds, and all with ``apart``, become :class:`Observations`.
     Beside images of a board positions and rows in sockets become readings of points of the same tool, see
     sensors/tool_frames.py.
-
-    Raises:
-        MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
+    MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
     """
     pieces = _pieces(tables)
     if any("corners" in table.columns for table, _ in pieces):

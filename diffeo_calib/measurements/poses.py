@@ -42,10 +42,8 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
             SciPy's letters: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
         angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; other conventions have no unit.
         place: names a row in messages.
-
-    Raises:
-        InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
-            whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
+    InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
+        whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
     """
     count = numbers_of(convention, angle)
     fix = f"pass the {count} numbers of {convention!r} in every row"
@@ -82,9 +80,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
 
     Where a rotation can be written in several ways, quaternions have a non-negative scalar, rotation vectors are no
     longer than pi, and Euler angles are SciPy's choice.
-
-    Raises:
-        InputError: unknown convention or unit, or no rotation matrices.
+    InputError: unknown convention or unit, or no rotation matrices.
     """
     count, given = numbers_of(convention, angle), real_tensor(matrices, "rotations").detach()
     if given.ndim < 3 or given.shape[-2:] != (3, 3):
@@ -120,9 +116,7 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     """The poses (N, 4, 4), m, whose three points are nearest to points (N, 3, 3), m, in the sum of squares.
 
     They are detached, except inside transforms of torch.func and while a program is recorded.
-
-    Raises:
-        InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
+    InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
     """
     check_lever(lever)
     if isinstance(points, Tensor) and wrapped(points):
@@ -199,9 +193,7 @@ def of_frames(values: Tensor) -> Tensor:
 
 def checked_frames(poses: object) -> Tensor:
     """Check poses (N, 4, 4) or (N, T, 4, 4) and return the nearest rigid ones (N, T, 4, 4), NaN where hidden.
-
-    Raises:
-        InputError: wrong shape, values that are not finite, no rigid transform, or a row without any frame.
+    InputError: wrong shape, values that are not finite, no rigid transform, or a row without any frame.
     """
     given = real_tensor(poses, "poses").detach()
     if given.ndim != 4 or given.shape[1] < 2:
@@ -277,9 +269,7 @@ def own_blocks(matrix: Tensor, count: int) -> Tensor:
 
 def frame_tips(on: Sequence[str] | None, frames: int) -> tuple[str, ...]:
     """Names of measured frames: those of their tips, or frame1, frame2, ... where these are not known.
-
-    Args:
-        on: names of the tips of their points, in threes. frames: how many there are.
+    on: names of the tips of their points, in threes. frames: how many there are.
     """
     tips = tuple(on[::POINTS]) if on is not None else ()
     return tips if len(set(tips)) == frames else tuple(f"frame{k + 1}" for k in range(frames))
@@ -308,10 +298,8 @@ def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
 
     Those of a camera on the tool are by errors (-dt, -dw) of the board's pose: shift, m, and turn, rad, along and about
     the axes of the camera. Coordinates of a point are adjacent.
-
-    Args:
-        poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
-        board: (N, 3) its origin in the camera's frame, m; None if the measuring device stood and saw the tool.
+    poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
+    board: (N, 3) its origin in the camera's frame, m; None if the measuring device stood and saw the tool.
     """
     if board is None:
         return mark_jacobian(poses, lever)

@@ -57,7 +57,7 @@ class Readings(RowGroups):
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
-    NUMBERED = "device", "names"
+    NUMBERED, COMPARED = ("device", "names"), ("q", "values", "device")
     flattery = FLATTERY
     fewest = FEWEST_PER_DEVICE  # rows of a device from which its place is found
     blocks = ()  # known distances between devices, see :attr:`SocketReadings.blocks`
@@ -240,13 +240,6 @@ class Readings(RowGroups):
         return self.names, self.offset_std
 
     @property
-    def sha256(self) -> str:
-        """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
-        names = {"kind": self.kind.encode(), "names": repr(self.stated).encode()}
-        arrays = {"q": self.q, "values": self.values, "device": self.device, "std": self.std, "payload": self.payload}
-        return self.file_sha256 or checks.arrays_sha256(arrays, names)
-
-    @property
     def column_kind(self) -> object:
         """Key that is equal for tables that can be joined into one."""
         return self.kind, self.offset_std, self.intrinsics, self.unit, self.std is None
@@ -255,10 +248,6 @@ class Readings(RowGroups):
     def ball_tip(self) -> str | None:
         """Name of the tip that carries the ball; None for the only one."""
         return self.on
-
-    def __repr__(self) -> str:
-        devices = len(self.names)
-        return f"Readings({len(self)} {self.kind}s of {devices} device" + "s" * (devices != 1) + ")"
 
     @property
     def value_names(self) -> tuple[str, ...]:
@@ -285,11 +274,6 @@ class Readings(RowGroups):
         """Return the same readings with their ball on this tip, one name, else MeasurementError."""
         names = checks.tip_names(on, 1)
         return with_attributes(self, on=None if names is None else names[0])
-
-    @property
-    def compared(self) -> Tensor:
-        """See :class:`RowGroups`."""
-        return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
 
 
 MARKER, CONTACT = "marker", "contact"  # kinds of readings of points of a tool whose poses are measured
@@ -342,6 +326,7 @@ class SocketReadings(Readings):
     """
 
     ALIKE = (*Readings.ALIKE, "distances", "distance_std")
+    COMPARED = ("q",)  # in one configuration the ball rests in one socket
     flattery, fewest = FLATTERY_OF_SOCKETS, 2
 
     distances: NamedDistances = ()
@@ -391,20 +376,11 @@ class SocketReadings(Readings):
 
     @property
     def stated(self) -> object:
-        """See :class:`Readings`."""
         return super().stated, self.distances, self.distance_std
-
-    def __repr__(self) -> str:
-        return f"SocketReadings({len(self)} rows in {len(self.names)} socket{'s' * (len(self.names) != 1)})"
 
     def measured(self) -> dict[str, Any]:
         """The names of the sockets."""
         return {"socket": self.device_names}
-
-    @property
-    def compared(self) -> Tensor:
-        """See :class:`RowGroups`: in one configuration the ball rests in one socket."""
-        return self.q
 
     def with_sessions(self, names: object, **_: object) -> Self:
         """Return the rows; MeasurementError for several sessions: sockets of another set-up are other sockets."""

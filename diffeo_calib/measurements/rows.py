@@ -69,7 +69,7 @@ class RowGroups:
     covariate_names: tuple[str, ...] = ()
     without_device: bool = True  # whether neither a position nor a pose was measured
     kind: Any
-    compared: Any  # (N, c) numbers in which a row that repeats another one equals it
+    COMPARED: ClassVar[tuple[str, ...]] = ("q",)  # columns in which a row that repeats another one equals it
     measured: Any
     """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
 
@@ -87,6 +87,21 @@ class RowGroups:
     def columns(self) -> dict[str, Tensor]:
         """The columns that this table has, by name."""
         return {name: values for name in self.BY_ROW if (values := getattr(self, name)) is not None}
+
+    @property
+    def stated(self) -> object:
+        """What is said of the devices, for :attr:`sha256`."""
+        return getattr(self, self.NUMBERED[1])
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
+        arrays, names = dict[str, Tensor](), dict[str, bytes]()
+        for part, rows in zip(self.parts, self.index, strict=True):
+            arrays |= {f"{len(names)} {name}": part.columns[name] for name in part.columns if name != "line_numbers"}
+            arrays |= {f"{len(names)} rows": rows}
+            names[f"{len(names)} {part.kind}"] = repr(part.stated).encode()
+        return self.file_sha256 or checks.arrays_sha256(arrays, names)
 
     @property
     def column_kind(self) -> object:
@@ -173,6 +188,9 @@ class RowGroups:
     def __len__(self) -> int:
         return len(self.q)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} rows, {self.n} joints)"
+
     def __getitem__(self, index: object) -> Self:
         return self.rows(index)
 
@@ -247,7 +265,8 @@ class RowGroups:
         """(earlier row, row) for every row that repeats an earlier one of its kind exactly; real repeats differ."""
         pairs = list[tuple[int, int]]()
         for part, rows in zip(self.parts, self.index, strict=True):
-            values = part.compared.cpu().numpy()
+            each = [getattr(part, name).to(part.q) for name in part.COMPARED]
+            values = torch.cat([numbers.reshape(len(part), -1) for numbers in each], 1).cpu().numpy()
             values = np.where(np.isnan(values), np.nan, values) + 0.0  # one kind of NaN; -0.0 becomes 0.0
             first: dict[bytes, int] = {}
             for numbers, row in zip(values, rows.tolist(), strict=True):
@@ -317,23 +336,11 @@ class RowGroups:
                     test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
 
-    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
-        """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
-
-        Where some positions were measured, they cover these: rows in sockets are in every ``train``.
-        MeasurementError for k below 2, or fewer distinct configurations than folds.
-        """
-        if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
-            raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
-        held, units, kind = self._divided
-        sizes, order = _shuffled(units, seed, kind, fewest=k, what=f"cannot make {k} folds")
-        load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
-        for group in order[np.argsort(-sizes[order], kind="stable")]:  # the largest first
-            fold_of[group] = load.argmin()
-            load[fold_of[group]] += sizes[group]
-        fold = np.full(len(self), -1)
-        fold[held] = fold_of[units.numpy()]
-        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
+    def place_lines(self, held_out: Self) -> Iterator[str]:
+        """A sentence where the sockets of one place alone are left beside rows that are held out."""
+        here, there = (len({*rows.places.tolist()} - {NO_SOCKET}) for rows in (self, held_out))
+        if here == 1 and there:
+            yield f"the sockets of one place alone are fitted, those of {there} more are held out: --holdout 0 fits all"
 
     @property
     def _divided(self) -> tuple[np.ndarray, Tensor, str]:
@@ -383,23 +390,17 @@ def in_train(labels: Tensor, fraction: float, seed: int, kind: str) -> np.ndarra
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
         raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
-    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
+    with checks.of_measurements():
+        generator = np.random.default_rng(check_seed(seed))
+    sizes = np.bincount(labels.numpy())
+    if len(sizes) < 2:
+        got = f"{len(sizes)} (in {len(labels)} rows; repeats, and the rows of a place, stay together)"
+        what, fix = "cannot split into train and test", "measure more of them"
+        raise MeasurementError.of(what, expected=f"at least 2 {kind}", got=got, fix=fix)
     target, rows, chosen = round(fraction * len(labels)), 0, []
-    for group in order:
+    for group in generator.permutation(len(sizes)):
         after = rows + sizes[group]
         nearer = abs(after - target) < abs(rows - target)
         if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
             rows, chosen = after, [*chosen, group]
     return np.isin(labels.numpy(), chosen)
-
-
-def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
-    with checks.of_measurements():
-        checked_seed = check_seed(seed)
-    sizes = np.bincount(labels.numpy())
-    if len(sizes) < fewest:
-        got = f"{len(sizes)} (in {len(labels)} rows; repeats, and the rows of a place, stay together)"
-        fix = "measure more of them, or ask for fewer parts"
-        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
-    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))

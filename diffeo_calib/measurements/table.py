@@ -70,7 +70,7 @@ class Measurements(ImageTable):
     BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
-    NUMBERED = "session", "session_names"
+    NUMBERED, COMPARED = ("session", "session_names"), ("q", "points")
 
     def __init__(
         self,
@@ -218,16 +218,6 @@ class Measurements(ImageTable):
         return pose_math.block_diagonal(factor @ factor.mT)
 
     @property
-    def sha256(self) -> str:
-        """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
-        measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
-        arrays = {"q": self.q, **measured, "std": self.std}
-        arrays |= {"rotation_std": self.rotation_std, "corners": self.corners}
-        arrays |= {"seen_by": self.seen_by if len(self.cameras) > 1 else None}
-        arrays |= {"payload": self.payload, "board": self.board}
-        return self.file_sha256 or checks.arrays_sha256(arrays)
-
-    @property
     def frames(self) -> Tensor | None:
         """(N, T, 4, 4) the measured poses, T = 1 included, m; NaN where hidden; None for points."""
         return None if self.poses is None else pose_math.by_frame(self.poses)
@@ -265,11 +255,6 @@ class Measurements(ImageTable):
     def kind(self) -> str:
         """Kind of the rows: "position" or "pose"."""
         return "position" if self.poses is None else "pose"
-
-    @property
-    def compared(self) -> Tensor:
-        """See :class:`RowGroups`."""
-        return torch.cat([self.q, self.points.flatten(1)], dim=1)
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")

@@ -100,6 +100,19 @@ class Command:
         captured = self.capsys.readouterr()
         return Outcome(int(str(code or 0)), captured.out, captured.err)
 
+    def failed(self, *arguments: object) -> str:
+        """The one error sentence of a command that is refused."""
+        done = self(*arguments)
+        assert done.code == 1, done.out
+        return done.error
+
+    def ran(self, *arguments: object, silent: bool = False) -> Outcome:
+        """Of a command that must succeed, ``silent``: and write nothing to its standard error."""
+        done = self(*arguments)
+        assert done.code == 0, done.err
+        assert not silent or not done.err.strip(), done.err
+        return done
+
 
 def environment() -> dict[str, str]:
     """The environment of this process, with the package importable and room for the tables."""

@@ -15,9 +15,12 @@ def recorded() -> guard.Cases:
     return guard.cases(guard.read(BASELINE))
 
 
-def test_a_robot_is_calibrated_as_well_as_recorded(recorded: guard.Cases) -> None:
+def test_a_robot_is_calibrated_as_well_as_recorded(recorded: guard.Cases, monkeypatch: pytest.MonkeyPatch) -> None:
+    verbs = {"calibrate", "evaluate", "predict", "registered", "recalibrate", "compare"}
+    kept = {verb: work for verb, work in guard.guard_verbs.VERBS.items() if verb in verbs}
+    monkeypatch.setattr(guard.guard_verbs, "VERBS", kept)
     found = guard.cases(guard.measured(guard.QUICK[0]))
-    assert {verb for verb, _ in found} >= {"calibrate", "evaluate", "predict", "registered", "recalibrate", "compare"}
+    assert {verb for verb, _ in found} == verbs
     rows, worse = guard.judged(found, recorded, ANY_PROCESSOR)
     assert rows[-1]["errors"] >= 5
     assert not worse

@@ -11,23 +11,23 @@ import pytest
 from command_bank import environment
 
 PROGRAM = """
-import sys, kills, campaign_faults
+import sys, kills, campaign_faults, product_bank
+kills.fit.calibrate = product_bank.with_usual_scales
 kills.ROWS = {"measured.csv": 12, "joints.csv": 300, "program.csv": 10}
 for program, count in ((kills, "4"), (campaign_faults, "1")):
     sys.argv = [program.__name__, "--count", count, "--seed", "1", "--out", program.__name__ + ".json"]
     program.harness.guarded(program.program)
 """
-"""With small tables: whether files are whole does not depend on their rows."""
-FOLDER = Path(__file__).parents[2] / "benchmarks" / "robustness"
+"""With small tables and given scales: whether files are whole does not depend on them."""
+FOLDERS = [Path(__file__).parents[2] / "benchmarks" / "robustness", Path(__file__).parents[1] / "banks"]
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Those of both programs, which load everything once."""
     folder, env = tmp_path_factory.mktemp("kills"), environment()
-    env["PYTHONPATH"] = os.pathsep.join([str(FOLDER), env["PYTHONPATH"]])
+    env["PYTHONPATH"] = os.pathsep.join([*map(str, FOLDERS), env["PYTHONPATH"]])
     command = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=env, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

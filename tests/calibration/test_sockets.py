@@ -195,9 +195,11 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     train, test = data.split(0.7, seed=1)
     assert (len(train), len(test)) == (24, 12)
     assert len({name.split("/")[0] for name in test.names}) == 1
-    assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
-    with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
-        data.folds(4)
+    assert [*train.place_lines(test)] == []
+    one, other = data.rows(data.places < 2).split(0.7)
+    assert "those of 1 more are held out: --holdout 0" in "".join(one.place_lines(other))
+    with pytest.raises(MeasurementError, match="expected at least 2 places with sockets, got 1"):
+        test.split()
 
 
 MIXED = kind_named("mixture")

@@ -20,13 +20,12 @@ cv2 = pytest.importorskip("cv2")
 from rendered_board import BOARD, rendered, texture  # noqa: E402
 
 from diffeo_calib.cameras.detection import Board, misfit, other_layout  # noqa: E402
-from diffeo_calib.measurements.image_folders import read_folders  # noqa: E402
+from diffeo_calib.measurements.bags import read_folders  # noqa: E402
 
 FOUND = Board.of(BOARD)
 
 
 def flat(board: str, pixels: int = 60) -> np.ndarray:
-    """A sheet with a chessboard or a single marker, seen straight ahead."""
     kind, *words = board.split(":")
     if kind == "chessboard":
         across, down = map(int, words[0].split("x"))
@@ -41,9 +40,6 @@ def flat(board: str, pixels: int = 60) -> np.ndarray:
 @cache
 def image(number: int = 0, blur_px: float = 0.6) -> np.ndarray:
     return rendered(boards(8, seed=4)[number], texture(), blur_px=blur_px, seed=number)
-
-
-# --- corners --------------------------------------------------------------------------------------------------------
 
 
 def test_corners_are_found_to_hundredths_of_a_pixel() -> None:
@@ -102,14 +98,9 @@ def seen_grid(text: str, number: int = 0, squares: bool = False) -> np.ndarray:
 GRID = "aruco:{}:0.05:0.015:DICT_5X5_250{}"
 
 
-@pytest.mark.parametrize(
-    ("real", "said"),
-    [
-        (GRID.format("3x4", ":0:down-right"), GRID.format("3x4", "")),
-        (GRID.format("4x3", ":30:left-up"), GRID.format("4x3", "")),
-    ],
-)
-def test_another_layout_is_refused_and_named(real: str, said: str) -> None:
+@pytest.mark.parametrize(("size", "corner"), [("3x4", ":0:down-right"), ("4x3", ":30:left-up")])
+def test_another_layout_is_refused_and_named(size: str, corner: str) -> None:
+    real, said = (GRID.format(size, words) for words in (corner, ""))
     image = seen_grid(real)
     with pytest.raises(InputError, match=r"no plane explains, by \d+\.\d px|got none"):
         Board.of(said).corners(image)
@@ -149,9 +140,6 @@ def test_a_wide_lens_is_no_other_layout() -> None:
         Board.of(GRID.format("4x3", ":0:right-up")).corners(bent)
 
 
-# --- reasons --------------------------------------------------------------------------------------------------------
-
-
 ALONG = np.zeros((7, 7), np.float32)
 ALONG[3] = 1 / 7
 REASONS = {
@@ -169,9 +157,6 @@ def test_refused_images_are_named(reason: str) -> None:
         FOUND.corners(REASONS[reason](image()))
 
 
-# --- folders --------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     for number in range(3):
@@ -187,8 +172,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     out, page = folder / "corners.csv", folder / "page.html"
     words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out]
-    done = command(*words, "--report", page)
-    assert done.code == 0, done.err
+    done = command.ran(*words, "--report", page)
     assert "small.png: a resized" in done.out
     assert "text.png: cannot be read" in done.out
     lines = out.read_text().splitlines()
@@ -201,13 +185,12 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     assert text.count("<img") == 5
     assert "3 of 5 images" in text
     (folder / "joints.csv").write_text((folder / "joints.csv").read_text().replace(",", ";"))
-    done = command(*words, "--sep", ";", "--decimal", ",")
-    assert done.code == 0, done.err
+    done = command.ran(*words, "--sep", ";", "--decimal", ",")
     assert [line.replace(",", ".").replace(";", ",") for line in out.read_text().splitlines()] == lines
 
 
 def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("diffeo_calib.measurements.image_folders._seen", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("diffeo_calib.measurements.bags._seen", Mock(side_effect=KeyboardInterrupt))
     for name in ("corners.csv", "corners.yaml"):
         (folder / name).write_text("old")
     before = {path: path.read_bytes() for path in folder.iterdir()}
@@ -272,8 +255,7 @@ def test_folders_of_two_cameras_become_one_table(tmp_path: Path, command: Comman
             cv2.imwrite(str(tmp_path / camera / f"{k}.png"), image(k))
     (tmp_path / "joints.csv").write_text("image,q1\n" + "\n".join(f"{k}.png,{k}" for k in range(3)))
     folders, out = (tmp_path / "left", tmp_path / "right"), tmp_path / "corners.csv"
-    done = command("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
-    assert done.code == 0, done.err
+    command.ran("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
     head, *lines = out.read_text().splitlines()
     assert head.endswith("v,camera")
     found = {(line.split(",")[0], line.split(",")[-1]) for line in lines}

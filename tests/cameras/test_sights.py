@@ -34,19 +34,13 @@ def pose_errors(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return torch.cat([(found - truth)[:, :3, 3], torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)], 1)
 
 
-# --- formulas -------------------------------------------------------------------------------------------------------
-
-
-def test_derivatives_of_pixels() -> None:
+def test_derivatives_of_pixels_and_those_of_opencv() -> None:
     lens = CAMERA.lens
     points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64)
     by_point, by_lens = project_slopes(points, lens)
     full: Any = jacobian(lambda p: project(p, lens), points)
     assert_close(by_point, torch.stack([full[i, :, i] for i in range(3)]), rtol=0, atol=1e-9)
     assert_close(by_lens, jacobian(lambda own: project(points, own), lens), rtol=0, atol=1e-9)
-
-
-def test_opencv_projects_alike() -> None:
     cv2 = pytest.importorskip("cv2")
     points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4]], dtype=torch.float64)
     fx, fy, cx, cy, *distortion = CAMERA.lens.tolist()
@@ -55,16 +49,12 @@ def test_opencv_projects_alike() -> None:
     assert_close(project(points, CAMERA.lens), torch.from_numpy(pixels[:, 0]), rtol=0, atol=1e-9)
 
 
-def test_a_board_is_printed_as_its_formula_says() -> None:
-    """Scales along x and y, and deflections per half of its larger side."""
+def test_the_formula_of_a_board_and_what_a_camera_sees() -> None:
+    """Boards as those of its images were: not from farther away, from behind, nor outside of the image."""
     point, board = FOUND.poses.new_tensor([0.03, 0.02, 0.0]), FOUND.poses.new_tensor([1e-3, 2e-3, 0.01, 0.02, 0.03])
     bent = 0.1 * (0.01 * 0.3**2 + 0.02 * 0.3 * 0.2 + 0.03 * 0.2**2)
     expected = torch.tensor([1.003 * 0.03, 0.999 * 0.02, bent], dtype=torch.float64)
     assert_close(real_board(point, board, 0.1), expected, rtol=1e-12, atol=1e-15)
-
-
-def test_a_camera_sees_boards_as_those_of_its_images_were() -> None:
-    """Not from farther away, from behind, nor outside of the image; how flat they were is the smallest cosine."""
     camera, poses = FOUND.camera, FOUND.poses
     assert camera.view is not None
     assert bool(sees(camera, poses).all())
@@ -76,9 +66,6 @@ def test_a_camera_sees_boards_as_those_of_its_images_were() -> None:
     behind = rotation(torch.tensor([[torch.pi, 0.0, 0.0]], dtype=torch.float64)) @ poses[:, :3, :3]
     for R, place in ((poses[:, :3, :3], 2.0 * middle), (behind, middle), (poses[:, :3, :3], middle + away.max())):
         assert not bool(sees(camera, transforms(R, place - R @ camera.corners.mean(0))).any())
-
-
-# --- the estimate ---------------------------------------------------------------------------------------------------
 
 
 def test_truth_is_found_within_its_deviations() -> None:
@@ -111,7 +98,6 @@ def test_images_of_one_camera_in_two_parts_with_a_known_lens_tell_the_same() -> 
 
 
 def test_poses_and_shared_errors_are_the_whole_posterior() -> None:
-    """The marginal covariance of all poses from the dense information of all unknowns."""
     few, _ = images(5, NOISE, seed=3)
     found = sighted(few)
     N, scale = len(found.poses), found.camera.noise
@@ -145,29 +131,25 @@ def test_opencv_finds_the_same_lens() -> None:
     pixels = [IMAGES.pixels[k, own].float().numpy() for k, own in enumerate(seen)]
     size = (IMAGES.width, IMAGES.height)
     _, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, size, None, None)
-    theirs = torch.tensor(
-        [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:5].tolist()], dtype=torch.float64
-    )
+    theirs = torch.tensor([*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *distortion.ravel()[:5]], dtype=torch.float64)
     away = (exact.camera.lens - theirs) / exact.camera.deviations[: len(LENS)]
     assert float(away.abs().max()) < 0.7
 
 
-def test_wrong_corners_hardly_count() -> None:
+def test_wrong_corners_a_longer_focal_length_and_sentences() -> None:
     pixels = IMAGES.pixels.clone()
     pixels[::3, 5] += 30.0
     away = (sighted(replace(IMAGES, pixels=pixels)).camera.unknowns - CAMERA.unknowns) / FOUND.camera.deviations
     assert float(away.abs().max()) < 5.0
-
-
-def test_a_longer_focal_length_is_an_error_of_the_lens_alone() -> None:
     whole = FOUND.camera.root
     assert_close(whole @ FOUND.camera.longer, FOUND.camera.unknowns * (torch.arange(len(whole)) < 2))
     board = torch.randn(5, 5, dtype=whole.dtype, generator=seeded(0))
     exact = replace(FOUND.camera, root=torch.cat([torch.zeros_like(whole[: len(LENS), :5]), board]))
     assert not bool(exact.longer.any())  # and not what rounding makes of it
-
-
-# --- files ----------------------------------------------------------------------------------------------------------
+    text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
+    assert all(name in text for name in LENS)
+    assert "lengths in the images are the board's" in text
+    assert set(UNKNOWNS) < set(FOUND.camera.entry())
 
 
 def test_files_keep_a_camera(tmp_path: Path) -> None:
@@ -213,9 +195,7 @@ LENSES = {
 }
 REFUSED = {
     "fisheye of ROS": (ECHO.format("equidistant", FIVE[:-5]), "equidistant"),
-    "fisheye of OpenCV": (STORAGE + f"fisheye_model: 1\nD: [{FIVE[:-5]}]\n", "fisheye_model 1"),
     "omni": (KALIBR.format("omni", FIVE[:-5], "radtan") + "  intrinsics: [1.2, 500, 510, 310, 235]", "omni"),
-    "double sphere": (KALIBR.format("ds", "", "none") + "  intrinsics: [-0.2, 0.6, 500, 510, 310, 235]", "ds"),
     "KannalaBrandt8": ("Camera.type: 'KannalaBrandt8'\nCamera.fx: 500.\nCamera.k1: 0.1\n", "KannalaBrandt8"),
     "division": (ECHO.format("division", "-0.2"), "division"),
     "rational": (ECHO.format("rational_polynomial", FIVE + ", 0.1, 0.0, 0.0"), "0.1, 0.0, 0.0"),
@@ -224,7 +204,6 @@ REFUSED = {
     "no size": (STORAGE.replace("image_size", "size") + f"D: [{FIVE}]\n", "image_width"),
     "nothing": ("", r"camera\.yaml.*camera_matrix"),
     "a tag without an end": ("<" + 900_000 * "a", "camera_matrix"),  # which quadratic time would not read
-    "words": ("camera_matrix:\n  data: [1, x]\n", r"camera\.yaml.*camera_matrix"),
     "no lens": ("a: [1, 2]\nimage_width: 3\nimage_height: 3\nd: [0, 0, 0, 0]", r"`camera_matrix`.*`k`.*Kalibr.*fx"),
 }
 
@@ -249,17 +228,14 @@ def test_lenses_that_files_leave_open_are_said(tmp_path: Path) -> None:
 FILE = camera_text(FOUND.camera)
 DAMAGED = {
     "a number that is none": (r"image_width: \d+", "image_width: e", "image_width"),
-    "a negative size": (r"image_height: \d+", "image_height: -5", "image_height"),
     "no row of the root": (r"root:(.*)data: \[[^,]*, ", r"root:\1data: [", "root"),
     "no root": (r"root:(.*)data: \[.*\]", r"root:\1data: []", "root"),
     "a matrix without an end": (r"\]", "", "camera_matrix"),
     "a number beyond all cameras": (r"data: \[", "data: [1e300, ", "distortion_coefficients"),
     "no text": (r"camera_matrix", "\udcff", "utf-8"),
 }
-REFUSED |= {
-    damage: (re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}")
-    for damage, (pattern, other, message) in DAMAGED.items()
-}
+for damage, (pattern, other, message) in DAMAGED.items():
+    REFUSED[damage] = re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}"
 for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # nor these
     REFUSED[f"long {piece}"] = "camera_matrix:" + piece * (900_000 // len(piece)), "camera_matrix"
     REFUSED[f"too long {piece}"] = piece * (1_100_000 // len(piece)), "too large for a camera file: .* at most 1 MB"
@@ -275,9 +251,6 @@ def test_other_and_damaged_files_are_refused(form: str, tmp_path: Path) -> None:
         read_camera(path)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------
-
-
 def test_corners_that_tell_no_pose_are_refused() -> None:
     pixels, points = IMAGES.pixels.clone(), IMAGES.points.clone()
     pixels[3, 4:] = torch.nan
@@ -291,10 +264,3 @@ def test_corners_that_tell_no_pose_are_refused() -> None:
     ):
         with pytest.raises(MeasurementError, match=message):
             sighted(wrong)
-
-
-def test_sentences_name_everything() -> None:
-    text = " ".join([*FOUND.camera.sentences(), FOUND.camera.board_sentence()])
-    assert all(name in text for name in LENS)
-    assert "lengths in the images are the board's" in text
-    assert set(UNKNOWNS) < set(FOUND.camera.entry())

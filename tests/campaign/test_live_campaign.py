@@ -104,9 +104,7 @@ def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measur
         assert campaign.accepted == list(range(ROWS + 1))
 
 
-def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
-    running: dc.Campaign, measured: tuple[Tensor, Tensor]
-) -> None:
+def test_a_moved_device_and_a_joint_are_named(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (torch.cat([own[ROWS:], more]) for own, more in zip(measured, ARM.measure(2, seed=11), strict=True))
     away = torch.tensor([0.5 * MM, -0.3 * MM, 0.4 * MM], dtype=y.dtype)
     other = q + torch.tensor([0, 2e-3, 0, 0, 0, 0], dtype=q.dtype)
@@ -124,9 +122,7 @@ def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
 
 
 @pytest.mark.parametrize(("wrong", "axis"), [(3, 0), (5, 2)])
-def test_rows_near_a_wrong_one_stay(
-    running: dc.Campaign, measured: tuple[Tensor, Tensor], wrong: int, axis: int
-) -> None:
+def test_rows_near_a_wrong_one_stay(running: dc.Campaign, measured: tuple[Tensor, ...], wrong: int, axis: int) -> None:
     """Along a motion a move of the device would explain 0.4 mm of one row as well: it was named in a third of these."""
     share = torch.linspace(0, 1, 16, dtype=torch.float64)[:9, None]
     q = measured[0][ROWS] * (1 - share) + measured[0][ROWS + 1] * share
@@ -252,7 +248,8 @@ def test_set_ups_come_one_after_the_other(measured: tuple[Tensor, Tensor]) -> No
     assert campaign.table.device_names == ["monday"] * 13 + ["tuesday"] * 6
 
 
-def test_the_limit_holds_95_percent_of_errors() -> None:
+def test_limits_and_goals(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    """The limit holds 95 % of errors; near the goal scales are selected at 15 % more rows, else at twice as many."""
     random = torch.Generator("cpu").manual_seed(0)
     root = torch.randn(60, 20, generator=random, dtype=torch.float64)
     errors = (root @ torch.randn(20, 4000, generator=random, dtype=torch.float64)).square().mean(0).sqrt()
@@ -260,10 +257,6 @@ def test_the_limit_holds_95_percent_of_errors() -> None:
     limit = limit_of(float(S.diagonal().mean().sqrt()), S, 0.0)
     assert float((errors < limit).double().mean()) == pytest.approx(0.95, abs=0.015)
     assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
-
-
-def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
-    """Near the goal scales are selected at 15 % more rows, else at twice as many."""
     campaign: Any = copy.deepcopy(running)
     known, limit = campaign.expected_error, campaign.error_limit
     assert 1.1 < limit / known < 2

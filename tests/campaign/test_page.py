@@ -30,7 +30,6 @@ def answer(page: Page, method: str, path: str, **headers: str) -> int:
 
 
 def decided(page: Page) -> list[tuple[str, int]]:
-    """What two buttons decided."""
     both = page.decisions.get(timeout=5), page.decisions.get(timeout=5)
     return [(one["do"], one["line"]) for one in both if isinstance(one, dict)]
 
@@ -41,7 +40,7 @@ def page() -> Iterator[Page]:
         yield running
 
 
-def test_only_this_machine_under_its_own_name(page: Page) -> None:
+def test_only_who_may_sees_the_page_and_the_last_state(page: Page) -> None:
     assert page.url.startswith("http://127.0.0.1:")
     assert answer(page, "GET", "/") == 200
     assert answer(page, "GET", "/", Host="evil.example:80") == answer(page, "GET", "/state", Host="evil.example") == 403
@@ -62,9 +61,6 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
     assert answer(page, "POST", "/reject?line=3", **mine) == 200
     assert answer(page, "POST", "/accept?line=4", **mine) == 200
     assert decided(page) == [("reject", 3), ("accept", 4)]
-
-
-def test_another_address_needs_the_token_and_the_last_state_is_seen(page: Page) -> None:
     for address in ("x", "70000", f"{urlsplit(page.url).port}", "no-such-host.invalid:0"):
         with pytest.raises(InputError), served(address, Queue()):
             pass

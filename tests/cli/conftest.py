@@ -22,7 +22,6 @@ else:
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    """40 rows of one marker."""
     return make_site(tmp_path_factory.mktemp("site"), rows=40)
 
 
@@ -50,13 +49,11 @@ def model(fitted: Outcome, site: Site) -> dc.CalibratedKinematics:
 
 @pytest.fixture(scope="session")
 def small_site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    """30 rows, for tests of wrong input."""
     return make_site(tmp_path_factory.mktemp("small_site"), rows=30)
 
 
 @pytest.fixture(scope="session")
 def sound(small_site: Site) -> bytes:
-    """A model file of the small site."""
     path = small_site.folder / "sound.safetensors"
 
     def make() -> bytes:
@@ -70,7 +67,6 @@ def sound(small_site: Site) -> bytes:
 
 @pytest.fixture(scope="session")
 def sound_path(small_site: Site, sound: bytes) -> Path:
-    """The model file of the small site."""
     assert sound
     return small_site.folder / "sound.safetensors"
 

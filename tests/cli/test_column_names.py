@@ -73,10 +73,20 @@ def test_wished_places_are_no_markers(measured: str, wished: str) -> None:
         assert found == [(places[0], "wished places"), (places[1], "")]
 
 
-def test_two_markers_stay_two() -> None:
+def test_markers_deviations_and_rotations() -> None:
     for one, other in (("{}", "{}"), *(("b_{}", name) for name in ("left_{}", "{}1", "target 1 {}", "m{}"))):
         both = [triple(one), triple(other, "XYZ")]
         assert bodies_in([*both[0], *both[1]]) == [Body(names, []) for names in both]
+    names = triple("Std {} [mm]")
+    assert guess_deviations(names[::-1], [triple("{} actual [mm]")]) == names
+    assert guess_deviations(names[:2], [triple("{} actual [mm]")]) is None
+    assert [own.turn for own in bodies_in([*triple("tip_{}"), *triple("m2_{}")])] == [[], []]
+    assert bodies_in(["x", "y", "z", "rx", "ry"]) == [Body(["x", "y", "z"], [])]
+    for names in ("{} rot {}", "{}_r{} [deg]"):
+        each = [[names.format(body, axis) for axis in "xyz"] for body in "ab"]
+        places = [name for body in "ab" for name in triple(f"{body}_{{}}")]
+        found = bodies_in(["Goal roll", "Goal pitch", "Goal yaw", *each[0], *each[1], *places])
+        assert [own.turn for own in found] == each
 
 
 @pytest.mark.parametrize("other", ["v{}", "gyro_{}", "rot_{}", "d{}", "force {} [N]", "sigma_{}", "q_{}"])
@@ -105,27 +115,10 @@ def test_which_columns_are_the_joints() -> None:
     assert guess_joints([*names, "E1"], ARM)[0].names[3] == "E1"
 
 
-def test_deviations_are_named_as_what_they_are_of() -> None:
-    names = triple("Std {} [mm]")
-    assert guess_deviations(names[::-1], [triple("{} actual [mm]")]) == names
-    assert guess_deviations(names[:2], [triple("{} actual [mm]")]) is None
-
-
-def test_rotations_belong_to_the_places_that_are_named_alike() -> None:
-    assert [own.turn for own in bodies_in([*triple("tip_{}"), *triple("m2_{}")])] == [[], []]
-    assert bodies_in(["x", "y", "z", "rx", "ry"]) == [Body(["x", "y", "z"], [])]
-    for names in ("{} rot {}", "{}_r{} [deg]"):
-        each = [[names.format(body, axis) for axis in "xyz"] for body in "ab"]
-        places = [name for body in "ab" for name in triple(f"{body}_{{}}")]
-        found = bodies_in(["Goal roll", "Goal pitch", "Goal yaw", *each[0], *each[1], *places])
-        assert [own.turn for own in found] == each
-
-
 PAGE = Path(__file__).parents[2] / "scripts/docs/pages/howto/makers.md"
 TABLE = PAGE.read_text(encoding="utf-8").split("\n## ")[1]
-MAKERS = {
-    maker: names.removesuffix(",...").split(",") for maker, names in re.findall(r"\n\| ([^|]*) \| `([^`]*)`", TABLE)
-}
+ROWS = re.findall(r"\n\| ([^|]*) \| `([^`]*)`", TABLE)
+MAKERS = {maker: names.removesuffix(",...").split(",") for maker, names in ROWS}
 assert len(MAKERS) == TABLE.count("\n| ") - 1 >= 11
 
 

@@ -45,9 +45,6 @@ def from_the_tool(path: Path, commanded: Tensor, convention: str = "xyz", angle:
     return poses_table(path, commanded, seen(commanded, camera_on_tool=True), convention, angle)
 
 
-# --- what `init` finds ---
-
-
 def places(rows: int = 20, axes: int = 3, size: float = 1.0) -> Tensor:
     return size * torch.rand(rows, axes, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -75,14 +72,12 @@ def at_one_place(path: Path) -> Path:
 
 
 def without_turns(path: Path) -> Path:
-    """Every convention explains the rows."""
     commanded = flange()
     commanded[:, :3, :3] = commanded[0, :3, :3]
     return from_the_tool(path, commanded, "rotvec")
 
 
 def rotations_first(path: Path) -> Path:
-    """With a row without a board."""
     commanded, found = flange(), seen(flange(), camera_on_tool=True)
     turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (found, ("quat_xyzw",)))]
     poses = {"RX_RY_RZ": turns[0].rad2deg(), "X_Y_Z": 1e3 * commanded[:, :3, 3]}
@@ -229,14 +224,8 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     bodies = [["u", "v", "0"], ["x", "y", "0"]]
     points = dc.read_measurements(table, np.array(["q"]), bodies, length="m", angle="deg").points
     hidden = [-1] * 3
-    assert points.nan_to_num(-1.0).flatten(1).tolist() == [
-        [0.2, 0.3, 0, 0.4, 0.5, 0],
-        [*hidden, 0.6, 0.7, 0],
-        [0.4, 0.5, 0, *hidden],
-    ]
-
-
-# --- hand-eye ---
+    expected = [[0.2, 0.3, 0, 0.4, 0.5, 0], [*hidden, 0.6, 0.7, 0], [0.4, 0.5, 0, *hidden]]
+    assert points.nan_to_num(-1.0).flatten(1).tolist() == expected
 
 
 def check_hand_eye(path: Path, **truths: Tensor) -> None:
@@ -251,39 +240,34 @@ def check_hand_eye(path: Path, **truths: Tensor) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
-    """And the same poses again: predicted and planned under the names of the table, and corrected by little."""
     table, model, out = from_the_tool(tmp_path / "t.csv", flange()), tmp_path / "t.safetensors", tmp_path / "f.json"
-    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
-    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", out, "--report", tmp_path / "r")
-    assert done.code == 0, done.error
+    command.ran("init", table, "-o", tmp_path / "c.toml")
+    done = command.ran("fit", tmp_path / "c.toml", "--holdout", "0", "--json", out, "--report", tmp_path / "r")
     assert "camera in the frame of" in (tmp_path / "r").read_text(encoding="utf-8")
     check_hand_eye(out, camera_in_tip=CAMERA, board_in_base=BOARD)
-    done = command("export", model, "--camera", tmp_path / "camera")
-    assert done.code == 0, done.error
+    done = command.ran("export", model, "--camera", tmp_path / "camera")
     text = (tmp_path / "camera" / "easy_handeye2.calib").read_text(encoding="utf-8")
     assert 'calibration_type: "eye_in_hand"' in text
     x = float(text.partition("x: ")[2].partition("\n")[0])
     assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
     done = command("predict", model, table, "-o", tmp_path / "p.csv")
     assert "the poses are those of the camera on the tool, in the frame of the board that stands" in done.out
-    assert command("plan", model, "-n", "20", "--range", "X=450:600", "-o", tmp_path / "n.csv").code == 0
-    new = torch.tensor(
-        [[float(cell) for cell in row[:6]] for row in cells(tmp_path / "n.csv")[1:]], dtype=torch.float64
-    )
+    command.ran("plan", model, "-n", "20", "--range", "X=450:600", "-o", tmp_path / "n.csv")
+    poses = cells(tmp_path / "n.csv")
+    new = torch.tensor([[float(cell) for cell in row[:6]] for row in poses[1:]], dtype=torch.float64)
     assert bool(((new[:, 0] >= 450) & (new[:, 0] <= 600)).all())
     went = transforms(rotation_matrices(new[:, 3:], "xyz", angle="deg"), 1e-3 * new[:, :3])
     there = (torch.linalg.inv(went @ CAMERA) @ BOARD)[:, :3, 3]
     assert bool((there[:, 2] > 0.7 * there.norm(dim=1)).all()), "the board is ahead, in the rows within 38 degrees"
-    done = command("correct", model, table, "-o", tmp_path / "d.csv")
-    assert done.code == 0, done.error
+    done = command.ran("correct", model, table, "-o", tmp_path / "d.csv")
     (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
     for one, other in zip(before, after, strict=True):
         assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
-    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+    assert poses[0] == [*header[:6], "rank"]
     written = []  # a tool is a rotation vector whatever the poses are, and commands by default as the poses
     for convention, options in (("xyz", []), ("rotvec", ["--convention", "rotvec", "--rotation-angle", "deg"])):
         tool = ["--tool", "0,0,100,20,30,40", *options]
-        assert command("correct", model, table, *tool, "-o", tmp_path / "c.csv").code == 0
+        command.ran("correct", model, table, *tool, "-o", tmp_path / "c.csv")
         header, *rows = cells(tmp_path / "c.csv")
         at = header.index("command_z") + 1
         turns = [[float(cell) for cell in row[at : at + 3]] for row in rows]
@@ -294,14 +278,12 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
 @pytest.mark.usefixtures("given_scales")
 def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command, init: Any) -> None:
     init(in_opencv(tmp_path / "t.csv", seen(flange(), camera_on_tool=False)))
-    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
-    assert done.code == 0, done.error
+    command.ran("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
     check_hand_eye(tmp_path / "f.json", camera_in_base=BOARD, board_in_tip=CAMERA)
 
 
 @pytest.mark.usefixtures("given_scales")
 def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> None:
-    """The camera's place along the axis is open, which is said, and the next poses tilt."""
     commanded = flange()
     turn = torch.stack([*torch.zeros(2, len(commanded), dtype=torch.float64), drawn(len(commanded), seed=4)], 1)
     commanded[:, :3, :3] = turned(turn) @ torch.tensor(DOWN, dtype=torch.float64)
@@ -310,7 +292,7 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
     done = command("fit", table, *pose, *SEEN, "-o", tmp_path / "m")
     assert done.code in (0, 2), done.error
     assert re.search(r"is known to \d+ mm only: turn the tool about several axes", done.err)
-    assert command("plan", tmp_path / "m", "-n", "4", "-o", tmp_path / "n.csv").code == 0
+    command.ran("plan", tmp_path / "m", "-n", "4", "-o", tmp_path / "n.csv")
     _, *rows = cells(tmp_path / "n.csv")
     new = torch.tensor([[float(cell) for cell in row[3:6]] for row in rows], dtype=torch.float64)
     z = turned(new)[:, :, 2]
@@ -331,12 +313,7 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
 def test_poses_that_are_refused(pose: str, options: list[str], message: str, command: Command, tmp_path: Path) -> None:
     table = from_the_tool(tmp_path / "t.csv", flange())
     given = ["--robot-pose", pose, "--length", "mm", *(table if word == "t.csv" else word for word in options), *SEEN]
-    done = command("fit", table, *given, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert message in done.err
-
-
-# --- machines that err ---
+    assert message in command.failed("fit", table, *given, "-o", tmp_path / "m")
 
 
 @pytest.mark.slow
@@ -344,17 +321,15 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any
     commanded = places(80)
     measured = bent(commanded) + 2e-5 * drawn(80, 3, seed=2)
     init(write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * commanded, "x_y_z": 1e3 * measured}))
-    done = command("fit", tmp_path / "c.toml", "--report", tmp_path / "r.html")
-    assert done.code == 0, done.error
+    command.ran("fit", tmp_path / "c.toml", "--report", tmp_path / "r.html")
     report = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Why" in report
     assert "Gravity" not in report
     alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
-    done = command("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.error
+    command.ran("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
     assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     written = ["--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"]
-    assert command("export", tmp_path / "t.safetensors", *written).code == 0
+    command.ran("export", tmp_path / "t.safetensors", *written)
     field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
     assert field.shape == (32, 9)
     place, add, std = field.double().split(3, 1)
@@ -382,8 +357,7 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     assert "noise of the commands counts as the machine's errors" in done.out
     loaded: Any = dc.load(model)
     assert loaded.map.unresolved[1].sqrt() > 5e-5
-    done = command("export", model, "--field", tmp_path / "f.csv", "--grid", "5x3x2", "--length", "mm")
-    assert done.code == 0, done.error
+    done = command.ran("export", model, "--field", tmp_path / "f.csv", "--grid", "5x3x2", "--length", "mm")
     header, *rows = cells(tmp_path / "f.csv")
     added = torch.tensor([float(row[header.index("add_z [mm]")]) for row in rows])
     assert float(added.max() - added.min()) > 0.1
@@ -396,8 +370,7 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     assert init(table)[0]["robot-pose"] == "cmdx,cmdy"
     done = command("fit", tmp_path / "c.toml", "--holdout", "0")
     assert done.code in (0, 3), done.error
-    done = command("correct", tmp_path / "t.safetensors", table, "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.error
+    done = command.ran("correct", tmp_path / "t.safetensors", table, "-o", tmp_path / "p.csv")
     header, *rows = cells(tmp_path / "p.csv")
     assert {row[header.index("status")] for row in rows} == {"reached"}
     sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3

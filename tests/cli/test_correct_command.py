@@ -20,6 +20,7 @@ import diffeo_calib as dc
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
+EULER = ["--rotation", "rx,ry,rz", "--convention", "ZYX", "--rotation-angle", "deg"]
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in deg
 Rows = list[dict[str, str]]
@@ -60,7 +61,6 @@ def model(arm: Case, tmp_path: Path) -> dc.CalibratedKinematics:
 
 @pytest.fixture
 def program(arm: Case, tmp_path: Path) -> Path:
-    """Commands around the measured ones, between columns that mean nothing here."""
     q = np.degrees(arm.train.q[:12].numpy()) + np.random.default_rng(0).uniform(-1, 1, (12, 6))
     joints = [dict(zip(arm.robot.joint_names, map(written, row), strict=True)) for row in q.round(6).tolist()]
     write(tmp_path / "program.csv", [{"line": str(10 * k), **own, "note": f"a;b {k}"} for k, own in enumerate(joints)])
@@ -70,8 +70,7 @@ def program(arm: Case, tmp_path: Path) -> Path:
 def test_a_program_of_commands(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
     """At the new commands the model is where the nominal robot was at the old ones."""
     output, tool = program.with_name("corrected.csv"), ",".join(map(str, TOOL))
-    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--tool", tool, "-o", output)
-    assert done.code == 0, done.err
+    done = command.ran("correct", program.with_name("model.safetensors"), program, *UNITS, "--tool", tool, "-o", output)
     before, after, robot = read(program), read(output), model.robot
     names = list(robot.joint_names)
     added = [f"command_{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]
@@ -98,23 +97,14 @@ def test_a_program_of_commands(model: dc.CalibratedKinematics, program: Path, co
     assert f"{float((new - old)[:, 0].abs().max().rad2deg()):.4f}" in done.out
 
 
-@pytest.mark.parametrize(
-    ("frame", "options"),
-    [
-        ("base", []),
-        ("measuring", []),
-        ("base", ["--rotation", "rx,ry,rz", "--convention", "ZYX", "--rotation-angle", "deg"]),
-    ],
-)
-def test_a_program_of_targets(
-    frame: str, options: list[str], model: dc.CalibratedKinematics, program: Path, command: Command
-) -> None:
+@pytest.mark.parametrize(("frame", "options"), [("base", []), ("measuring", []), ("base", EULER)])
+def test_targets(frame: str, options: list[str], model: Any, program: Path, command: Command) -> None:
     """The poses that one run commands are targets of the next, in both frames and in another convention."""
     path, output, names = program.with_name("model.safetensors"), program.with_name("c.csv"), model.robot.joint_names
-    assert command("correct", path, program, *UNITS, "-o", output).code == 0
+    command.ran("correct", path, program, *UNITS, "-o", output)
     first = read(output)
     wanted = poses_of(first, "command_")
-    assert command("correct", path, program, *UNITS, *options[2:4], "-o", output).code == 0
+    command.ran("correct", path, program, *UNITS, *options[2:4], "-o", output)
     turns = [[own for name, own in row.items() if "command" in name][3:] for row in read(output)]
     seen = wanted if frame == "base" else model.geometry.base @ wanted
     rows = [{name: row[name] for name in names} for row in first]
@@ -123,8 +113,7 @@ def test_a_program_of_targets(
         row |= dict(zip(("x", "y", "z", "rx", "ry", "rz"), (*places, *turn), strict=True))
     write(program.with_name("targets.csv"), rows)
     given = [*UNITS, "--position", "x,y,z", *options, "--frame", frame, "--limit", 2.0]
-    done = command("correct", path, program.with_name("targets.csv"), *given, "-o", output)
-    assert done.code == 0, done.err
+    command.ran("correct", path, program.with_name("targets.csv"), *given, "-o", output)
     second = read(output)
     q = torch.from_numpy(np.radians(table(second, list(names))))
     reached = torch.tensor([row["status"] == "reached" for row in second])
@@ -146,15 +135,20 @@ def test_a_target_at_the_origin_stays_and_one_without_numbers_is_named(tmp_path:
 
 
 @pytest.mark.usefixtures("model")
-def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
+def test_a_path_and_rows_that_miss(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
     """Far targets and commands beyond the limits: the others are corrected, and the exit code is 0."""
+    output = program.with_name("c")
+    done = command.ran("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
+    names = list(model.robot.joint_names)
+    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
+    assert np.abs(change).max() <= 0.01 + 1e-9
+    assert any("the corrections of the path jump" in line for line in done.warnings)
     rows = read(program)
     names = [name for name in rows[0] if name not in ("line", "note")]
     rows[3][names[1]] = "900,0"
     write(program, rows)
     output, model = program.with_name("c"), program.with_name("model.safetensors")
-    done = command("correct", model, program, *UNITS, "--limit", 0.001, "-o", output)
-    assert done.code == 0
+    done = command.ran("correct", model, program, *UNITS, "--limit", 0.001, "-o", output)
     after = read(output)
     assert (after[3]["status"], after[3][names[0]], after[3]["command_x"], after[3]["miss_mm"]) == ("limit", "", "", "")
     assert "line 5: limit, no command is allowed: it starts beyond a joint's limit" in done.out
@@ -165,22 +159,11 @@ def test_rows_that_miss_are_listed(program: Path, command: Command) -> None:
     assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
 
 
-def test_a_path(model: dc.CalibratedKinematics, program: Path, command: Command) -> None:
-    output = program.with_name("c")
-    done = command("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
-    assert done.code == 0
-    names = list(model.robot.joint_names)
-    change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
-    assert np.abs(change).max() <= 0.01 + 1e-9
-    assert any("the corrections of the path jump" in line for line in done.warnings)
-
-
 def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -> None:
     model, output = posed.model, program.with_name("corrected.csv")
     dc.save(model, program.with_name("posed"))
     given = "--tool", "measured:30,-20,150"
-    done = command("correct", program.with_name("posed"), program, *UNITS, *given, "-o", output)
-    assert done.code == 0, done.err
+    command.ran("correct", program.with_name("posed"), program, *UNITS, *given, "-o", output)
     names = list(model.robot.joint_names)
     before, after = (torch.from_numpy(np.radians(table(read(path), names))) for path in (program, output))
     tool = model.measured_frame @ tool_transform([0.03, -0.02, 0.15])
@@ -208,8 +191,7 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
     program.write_text("\n".join([",".join([*names, *columns]), *(",".join(map(str, row)) for row in cells)]))
     targets = ["--position", "left_x,left_y,left_z", "--position", "right_x,right_y,right_z"]
     given = ["correct", path, program, *UNITS_OF_HANDS, *TOOLS, "-o", output, "--json", tmp_path / "out.json"]
-    done = command(*given, *targets)
-    assert (done.code, done.err) == (0, "")
+    done = command.ran(*given, *targets, silent=True)
     results = json.loads((tmp_path / "out.json").read_text())
     VALIDATOR.validate(results)
     misses, empty = results["results"]["misses"], [k == 2 for k in range(6)]
@@ -217,8 +199,7 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
     assert misses["left"]["angle_miss_deg"] is None
     assert "6 rows: 6 reached" in done.out
     assert [row["miss_right_mm"] == "" for row in read(output, ",")] == empty
-    done = command(*given)
-    assert done.code == 0
+    done = command.ran(*given)
     assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
     goals = arms.robot(torch.from_numpy(q)) @ torch.stack([tool_transform(place) for place in PLACES])
     expected = dc.compensate(arms, goals, q, tool=PLACES, bound=np.radians(20.0))
@@ -252,7 +233,6 @@ BOTH = ["--tip", "left", "--tip", "right"]
     ],
 )
 def test_wrong_options(options: list[str], message: str, program: Path, command: Command) -> None:
-    """Of a robot with two tips where some are named."""
     output, path = program.with_name("c.csv"), program.with_name("model.safetensors")
     if not options or "--tip" in options:
         arms = model_of(two_arms(program.parent), dc.RK4(1))

@@ -44,8 +44,7 @@ def numbers_in(path: Path) -> tuple[list[str], np.ndarray]:
 
 def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     """Numbers of all rows, and the residuals of each: measured minus predicted."""
-    done = command("evaluate", path, site.csv, *TABLE, "-o", tmp_path / "r.csv")
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("evaluate", path, site.csv, *TABLE, "-o", tmp_path / "r.csv", silent=True)
     assert model.provenance is not None
     assert model.provenance.table_sha256 == hashlib.sha256(site.csv.read_bytes()).hexdigest()
     digest = model.provenance.table_sha256[:12]
@@ -63,25 +62,16 @@ def test_evaluate(site: Site, path: Path, model: dc.CalibratedKinematics, comman
     np.testing.assert_allclose(cells[:, 2:], away, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--length", "m"], "1000 times too large: check their unit (--length)"),
-        (["--position", "my,mx,mz"], "left-handed: exchange two position columns"),
-    ],
-)
-def test_errors_that_no_robot_has_are_exit_1(
-    options: list[str], words: str, site: Site, path: Path, command: Command
-) -> None:
-    """A wrong unit, a left-handed frame: no table, and one sentence that names the mistake."""
-    done = command("evaluate", path, site.csv, *(TABLE[2:] if "--position" in options else TABLE), *options)
-    assert done.code == 1
-    assert "in all" not in done.out
-    assert words in done.error
+def test_errors_that_no_robot_has(site: Site, path: Path, command: Command) -> None:
+    too_large = ["--length", "m"], "1000 times too large"
+    mirrored = ["--position", "my,mx,mz"], "left-handed: exchange"
+    for options, words in (too_large, mirrored):
+        done = command("evaluate", path, site.csv, *(TABLE[2:] if "--position" in options else TABLE), *options)
+        assert (done.code, "in all" in done.out) == (1, False)
+        assert words in done.error
 
 
-def test_rows_that_repeat_those_of_the_fit_are_said(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """A copy of rows of the fit with fewer digits, but not rows of other poses; and copies among the new rows."""
+def test_rows_that_repeat_or_are_wrong(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
     (train, test), copies = site.data.split(0.7, seed=0), site.data[[0, 1, 1]]
     q, points = site.data.q.round(decimals=4), site.data.points
     for one, own, count in ((q, points, len(train)), (test.q, test.points, 0)):
@@ -89,15 +79,10 @@ def test_rows_that_repeat_those_of_the_fit_are_said(site: Site, path: Path, comm
         assert (f"{count} of 40 rows repeat joint values of the fit" in " ".join(done.out.split())) == bool(count)
     done = command("evaluate", path, written(site, tmp_path / "t.csv", copies.q, copies.points), *TABLE)
     assert "1 of 3 rows repeat an earlier row exactly: first row 4, of row 3" in done.warnings[0]
-
-
-def test_wrong_rows_are_named(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """One alone, and a block with its cause; the exit code is 0, since most rows are right."""
     points = site.data.points.clone()
     points[3] += 0.05
     points[30:] += torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
-    done = command("evaluate", path, written(site, tmp_path / "t.csv", site.data.q, points), *TABLE)
-    assert done.code == 0
+    done = command.ran("evaluate", path, written(site, tmp_path / "t.csv", site.data.q, points), *TABLE)
     assert "11 of 40 rows look wrong (numbers are lines of the file):" in done.out
     (warning,) = done.warnings
     assert "10 rows look wrong that follow one another: lines 32 to 41 to the end of the table" in warning
@@ -105,10 +90,8 @@ def test_wrong_rows_are_named(site: Site, path: Path, command: Command, tmp_path
 
 
 def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
-    """In blocks of seven rows."""
     command.monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", 7)
-    done = command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv")
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv", silent=True)
     assert [words in done.out for words in ("40 predictions written", f"; note: {NOTE}")] == [True, True]
     header, values = numbers_in(tmp_path / "p.csv")
     assert header == [*site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
@@ -128,16 +111,12 @@ def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command
         (["--convention", "XYZ"], ["euler1", "euler2", "euler3"]),
     ],
 )
-def test_predicted_poses_are_measurements_of_other_commands(
-    options: list[str], columns: list[str], command: Command, tmp_path: Path
-) -> None:
+def test_predicted_poses(options: list[str], columns: list[str], command: Command, tmp_path: Path) -> None:
     kind, path = kind_named("poses"), tmp_path / "p.csv"
-    done = command("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path)
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path, silent=True)
     printed = re.search(r"`evaluate` and `fit` read these poses with (--.*)", done.out)
     assert printed is not None
-    again = command("evaluate", kind.file, path, *UNITS, *shlex.split(printed[1]), "--json", tmp_path / "e.json")
-    assert again.code == 0
+    command.ran("evaluate", kind.file, path, *UNITS, *shlex.split(printed[1]), "--json", tmp_path / "e.json")
     assert json.loads((tmp_path / "e.json").read_text())["results"]["errors"]["all"]["rms_m"] < 1e-6
     header, *rows = path.read_text().splitlines()
     places, deviations = ["x", "y", "z", "std_x", "std_y", "std_z"], ["std_rx", "std_ry", "std_rz"]
@@ -185,12 +164,9 @@ def test_what_moved_is_named(marker: float, site: Site, path: Path, command: Com
     assert float(found[2]) > 99.0
 
 
-def test_the_registered_model(
-    site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
+def test_registered(site: Site, path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     new, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
-    done = command("evaluate", path, new, *TABLE, "--free", "both", "-o", output)
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("evaluate", path, new, *TABLE, "--free", "both", "-o", output, silent=True)
     assert done.numbers("8 with the places of the fit")[0] > 10.0
     assert done.numbers("8 with places found anew")[0] < 0.5
     for words in (
@@ -214,14 +190,11 @@ def test_the_registered_model(
 
 def test_options_of_the_registration(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
     new, two = table(site, tmp_path / "new.csv", MOVE, 8), table(site, tmp_path / "two.csv", MOVE, 2)
-    done = command("evaluate", path, new, *TABLE, "--free", "base")
-    assert done.code == 0
+    done = command.ran("evaluate", path, new, *TABLE, "--free", "base")
     assert "in the frame of 'flange'" not in done.out
     for words, message in (
         ([new, "-o", tmp_path / "m.safetensors"], "-o without --free: expected a table of errors, got "),
         ([new, "--free", "both", "-o", path], f"-o {path} is the file of MODEL; name another file."),
         ([two, "--free", "both"], "expected at least 3 rows, got 2"),
     ):
-        refused = command("evaluate", path, *words, *TABLE)
-        assert refused.code == 1
-        assert message in refused.error
+        assert message in command.failed("evaluate", path, *words, *TABLE)

@@ -16,9 +16,7 @@ from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
 
-def test_fit_prints_three_stages_in_training_and_held_out(
-    fitted: Outcome, site: Site, model: dc.CalibratedKinematics
-) -> None:
+def test_three_stages_in_training_and_held_out(fitted: Outcome, site: Site, model: dc.CalibratedKinematics) -> None:
     assert fitted.err.strip() == ""
     parts = dict(zip(("28 training", "12 held out"), site.data.split(0.7, seed=0), strict=True))
     rms = {label: [fitted.numbers(stage, label)[0] for stage in STAGES] for label in parts}
@@ -27,8 +25,6 @@ def test_fit_prints_three_stages_in_training_and_held_out(
         found = dc.evaluate(model, data)
         expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
         assert fitted.numbers(STAGES[2], label) == pytest.approx(expected, abs=1.01e-4)
-    assert "Position errors in mm by stage" in fitted.out
-    assert "converged" in fitted.out
     assert "look wrong" not in fitted.out
     assert model.report["outliers"] == 0
     (before, *_), (after, _, most, _) = (fitted.numbers(stage, "12 held out") for stage in STAGES[1:])
@@ -43,10 +39,8 @@ def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: 
     (data := site.data.rows([*range(20)])).points[7] += 0.03  # of a copy
     write_measurements(table, data, TableFormat("m", "rad", "\t"), joints=names)
     given = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--joints", ",".join(names), "--sep", "\\t"]
-    done = command("--verbose", "fit", table, *site.robot(), *given, "--holdout", 0, "-o", model)
-    assert done.code == 0
+    done = command.ran("--verbose", "fit", table, *site.robot(), *given, "--holdout", 0, "-o", model)
     assert not done.warnings
-    assert "held out │" not in done.out
     assert "no row was held out: these are errors on rows that were fitted" in done.out
     assert re.search(r"leave-one-out RMS: position \d+\.\d+ mm", done.out) is not None
     for stage in STAGES:
@@ -59,11 +53,9 @@ def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: 
     assert (loaded.report["rows"], loaded.report["outliers"]) == (20, 1)
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines() if "│" in line]
-    sizes = {
-        part.name: [f"{1e3 * part.displacement:.4f}", "" if part.angle is None else f"{1e3 * part.angle:.4f}"]
-        for part in parts(loaded)
-    }
-    assert {row[0]: row[1:] for row in rows if len(row) == 3} == sizes
+    sizes = [(part.name, 1e3 * part.displacement, part.angle) for part in parts(loaded)]
+    shown = [[name, f"{size:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, size, turn in sizes]
+    assert [row for row in rows if len(row) == 3][-len(sizes) :] == shown
 
 
 @pytest.mark.usefixtures("given_scales")
@@ -87,8 +79,7 @@ def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Com
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_demo(command: Command, tmp_path: Path) -> None:
-    done = command("demo", "--output", tmp_path / "demo", "--count", 30)
-    assert (done.code, done.err.strip()) == (0, "")
+    done = command.ran("demo", "--output", tmp_path / "demo", "--count", 30, silent=True)
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "report.html"}
     assert done.numbers("calibrated", "held out")[0] < done.numbers("geometric", "held out")[0]

@@ -1,6 +1,5 @@
 """--json: the results of every command for programs, as the schema describes them."""
 
-import ast
 import json
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from product_bank import Case
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.results import RESULTS, SCHEMA
+from diffeo_calib.reports.results import SCHEMA
 
 UNITS = ["--length", "mm", "--angle", "deg"]
 
@@ -25,36 +24,18 @@ def folder(arm: Case, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_schema_is_one_and_knows_what_commands_add() -> None:
+def test_errors_and_places_that_are_taken(folder: Path, command: Command) -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    sources = [path.read_text(encoding="utf-8") for path in (Path(dc.__file__).parent / "cli").rglob("*.py")]
-    calls = [node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
-    added = {
-        word.arg
-        for call in calls
-        if ast.unparse(call.func).endswith("record.add")
-        for word in call.keywords
-        if word.arg
-    }
-    assert {"rows", "files", "parts"} <= added <= set(RESULTS)
-
-
-def test_an_error_is_written_too(folder: Path, command: Command) -> None:
     words = "evaluate", "none.safetensors", folder / "new.csv", *UNITS, "--json", folder / "out.json"
     assert command(*words).code == 1
     written = json.loads((folder / "out.json").read_text(encoding="utf-8"))
     VALIDATOR.validate(written)
     assert (written["exit_code"], written["results"], written["arguments"][0]) == (1, {}, "evaluate")
     assert "none.safetensors" in written["error"]
-
-
-def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> None:
     model, predicted = folder / "arm.safetensors", folder / "p.csv"
     before = model.read_bytes()
     for place, words in ((model, "--json"), (predicted, "--json"), (folder / "none" / "x.json", "make its folder")):
-        done = command("predict", model, folder / "new.csv", *UNITS, "-o", predicted, "--json", place)
-        assert done.code == 1
-        assert words in done.error
+        assert words in command.failed("predict", model, folder / "new.csv", *UNITS, "-o", predicted, "--json", place)
     assert model.read_bytes() == before
     assert not predicted.exists()
 
@@ -68,11 +49,9 @@ def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> Non
         "fit c.toml",
     ],
 )
-def test_an_earlier_result_is_not_mistaken_for_this_one(
-    words: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_earlier_result_is_removed(words: str, folder: Path, command: Command) -> None:
     """The command ends before it could begin: nothing is left, whatever the exit code is looked at."""
-    monkeypatch.chdir(folder)
+    command.monkeypatch.chdir(folder)
     (folder / "out.json").write_text('{"format": "diffeo_calib result", "exit_code": 0}', encoding="utf-8")
     (folder / "c.toml").write_text('csv = "new.csv"\njson = "out.json"\nlength = "furlong"\n', encoding="utf-8")
     assert command(*words.split()).code in (1, 2)

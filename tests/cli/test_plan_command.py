@@ -16,7 +16,6 @@ UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 
 
 def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
-    """Joint values, rad, and ranks."""
     with path.open(newline="") as file:
         ranks = [int(row["rank"]) for row in csv.DictReader(file, delimiter=";")]
     return read_joints(path, replace(FORMAT, joints=robot)), ranks
@@ -27,8 +26,7 @@ def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> 
     cell = ["--tracker", "2500,300,600,0,0,1,40", "--floor", 100]
     cell += ["--range", "waist_joint=-60:90"]
     cell += ["--column", "600,0,80,400", "--marker", "50,0,100", "--draw", 200]
-    done = command("plan", *site.robot(), "-n", 25, "-o", output, *UNITS, *cell)
-    assert done.code == 0, done.err
+    done = command.ran("plan", *site.robot(), "-n", 25, "-o", output, *UNITS, *cell)
     robot = site.arm.nominal
     q, ranks = planned(output, robot)
     assert q.shape == (25, 6)
@@ -42,19 +40,14 @@ def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> 
     for shown in (rms, math.hypot(rms, expected.noise_rms)):  # of the model, and held out
         assert f" {1e3 * shown:.3f}" in done.out
     assert "25 of 200 configurations written to" in done.out
-    assert "perhaps far off: measure the first 20 poses" in done.out
 
 
-def test_next_poses_and_poses_to_measure_again(
-    site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
+def test_poses_to_measure_again(site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     first, again = tmp_path / "next.csv", tmp_path / "again.csv"
     file = site.folder / "model.safetensors"
-    done = command("plan", file, "-n", 6, "-o", first, *UNITS, "--candidates", site.csv)
-    assert done.code == 0, done.err
+    done = command.ran("plan", file, "-n", 6, "-o", first, *UNITS, "--candidates", site.csv)
     q, _ = planned(first, model.robot)
     torch.testing.assert_close(q, dc.plan(model, site.data.q, 6).q, rtol=0, atol=1e-8)
-    assert "guesses" not in done.out
     done = command(
         *("plan", file, "-n", 6, "-o", again, *UNITS, "--candidates", site.csv),
         *("--free", "base", "--measured", first, "--target-poses", first),
@@ -62,12 +55,10 @@ def test_next_poses_and_poses_to_measure_again(
     assert done.code == 0, done.err
     expected = dc.plan(model, site.data.q, 6, free="base", measured=q, target=q)
     torch.testing.assert_close(planned(again, model.robot)[0], expected.q, rtol=0, atol=1e-8)
-    assert "do not show where" not in done.out
     done = command("plan", file, "-n", 4, "-o", again, *UNITS, "--candidates", site.csv, "--free", "base")
     rms = dc.plan(model, site.data.q, 4, free="base").expected_rms
     assert rms[2] > 0.01 > rms[3]
     assert "fewer than 3 poses do not show where the measuring device is now" in done.out
-    assert "if nothing else has changed since the fit" in done.out
     assert f"{1e3 * float(rms[0]):.3f}" not in done.out  # its place, and no error of the robot
 
 
@@ -84,12 +75,8 @@ def test_next_poses_and_poses_to_measure_again(
         (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
     ],
 )
-def test_mistakes_are_one_sentence(
-    small_site: Site, sound_path: Path, command: Command, tmp_path: Path, options: list[str], *, message: str
-) -> None:
+def test_mistakes(options: list[str], message: str, small_site: Site, sound_path: Path, command: Command) -> None:
     words = {"MODEL": [sound_path], "ROBOT": small_site.robot(), "CSV": [small_site.csv]}
     arguments = [word for option in options for word in words.get(option, [option])]
-    done = command("plan", "-n", 3, "-o", tmp_path / "poses.csv", *UNITS, *arguments)
-    assert done.code == 1
-    assert message in done.error
-    assert not (tmp_path / "poses.csv").exists()
+    assert message in command.failed("plan", "-n", 3, "-o", small_site.folder / "poses.csv", *UNITS, *arguments)
+    assert not (small_site.folder / "poses.csv").exists()

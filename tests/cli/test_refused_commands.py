@@ -33,9 +33,7 @@ def test_wrong_usage_is_exit_2(words: str, command: Command) -> None:
     assert "Usage" in done.err
 
 
-def test_unconverged_is_exit_3_with_the_model_written(
-    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unconverged_is_exit_3(site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_measurements(tmp_path / "t.csv", site.data.rows(slice(11)), TableFormat("m", "rad"))
     monkeypatch.setattr("diffeo_calib.calibration.calibrate.GaussNewton", partial(dc.GaussNewton, max_iterations=1))
     path = tmp_path / "early.safetensors"
@@ -43,7 +41,6 @@ def test_unconverged_is_exit_3_with_the_model_written(
     done = command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", path, "--holdout", 0)
     assert done.code == 3
     assert "stopped at the limit of 1 iterations; judge it by held-out errors" in done.out
-    assert "pass fewer --controls" in done.out
     assert "max_iterations" not in done.out
     assert any("11 poses are too few to select scales" in warning for warning in done.warnings)
     assert isinstance(dc.load(path), dc.CalibratedKinematics)
@@ -100,30 +97,24 @@ def test_what_fit_refuses(message: str, small_site: Site, command: Command, tmp_
 
 @pytest.mark.slow
 def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
-    """tests/interop damages files in every way."""
     model, csv, out = tmp_path / "model.safetensors", small_site.csv, ["-o", tmp_path / "p.csv"]
     x = np.random.default_rng(0).uniform(-1, 1, (6, 2))
     kernels = dc.VonMises(1.0), dc.Gaussian(1.0)
     problem = dc.Problem(lambda q: q * 1.0, x, x + 0.01, noise=0.01, joint_kernel=kernels[0], task_kernel=kernels[1])
     dc.save(dc.fit(problem).model, tmp_path / "plain.safetensors")
     poses = edited(small_site, tmp_path / "t.csv", turned)
+    turns = ["--rotation", "i,j,k", *ROTATION[2:]]
     whole = sound, (tmp_path / "plain.safetensors").read_bytes()
     for content, words, message in (
         (b"", ["evaluate", small_site.urdf, csv, *TABLE], "it is a URDF; pass a file written by"),
         (whole[1], ["evaluate", model, csv, *TABLE], "plain function"),
         (whole[0], ["evaluate", model, csv, *TABLE, "--joints", "waist_joint"], "expected 6 columns, in the order"),
-        (
-            whole[0],
-            ["evaluate", model, poses, *TABLE, "--rotation", "i,j,k", *ROTATION[2:]],
-            "calibrated with points: expected measured points, got poses",
-        ),
+        (whole[0], ["evaluate", model, poses, *TABLE, *turns], "with points: expected measured points, got poses"),
         (whole[0], ["predict", model, csv, *TABLE[2:], "--convention", "rotvec", *out], "this model has none"),
         (whole[0], ["predict", model, csv, *TABLE[2:], "--rotation-angle", "deg", *out], "this model has none"),
     ):
         model.write_bytes(content)
-        done = command(*words)
-        assert done.code == 1
-        assert message in done.error
+        assert message in command.failed(*words)
         assert not (tmp_path / "p.csv").exists()
 
 

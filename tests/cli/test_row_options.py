@@ -24,7 +24,6 @@ SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std",
 
 @pytest.fixture(scope="module")
 def sockets(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table of 3 places x 2 sockets x 6 rows, and its robot."""
     where, arm = tmp_path_factory.mktemp("sockets"), SimulatedArm(seed=1)
     arm.write_urdf(where / "arm.urdf")
     write_socket_table(where / "t.csv", arm, "ab", 1)
@@ -38,23 +37,16 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
     campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
     campaign += ['angle = "deg"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
     (sockets / "c.toml").write_text("\n".join([*campaign, 'output = "m.safetensors"']))
-    fitted = command("fit", "c.toml")
-    assert fitted.code == 0, fitted.err
+    fitted = command.ran("fit", "c.toml")
     assert "Spread within sockets in mm by stage" in fitted.out
     assert "12 held out" in fitted.out, "one whole place"
     assert "known 50.000" in fitted.out
-    assert "2 to 6 times" in fitted.out
-    assert "robot base in the measuring frame" not in fitted.out
-    done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *DEG)
-    assert done.code == 0, done.err
-    assert "12 not used in the fit" in done.out
+    done = command.ran("evaluate", "m.safetensors", "t.csv", *SOCKETS, *DEG)
     assert done.out.count("known 50.000") == 3
-    assert "expected absolute error" in done.out
 
 
 @pytest.fixture(scope="module")
 def wires(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
     where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
     arm.write_urdf(where / "arm.urdf")
     write_wire_table(where / "t.csv", arm, 1)
@@ -82,11 +74,9 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
     ("options", "message"),
     [
         ([], "name the position columns, or those of --socket or --reading"),
-        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
         (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
-        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
@@ -94,10 +84,8 @@ def test_options_become_columns(text: str, columns: ReadingColumns, tmp_path: Pa
         (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
     ],
 )
-def test_refused_rows(
-    options: list[str], message: str, sockets: Path, wires: Path, command: Command, *, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(wires if "--reading" in options else sockets)
+def test_refused_rows(options: list[str], message: str, sockets: Path, wires: Path, command: Command) -> None:
+    command.monkeypatch.chdir(wires if "--reading" in options else sockets)
     done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())
@@ -129,7 +117,6 @@ def mixtures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def mixed(mixtures: Path) -> Path:
-    """A model file of these rows."""
     robot = dc.load_urdf(mixtures / "arm.urdf", "base_link", "flange")
     columns = {"socket": ["place", "socket"], "distances": {("a", "b"): 0.05}, "distance_std": 1e-5}
     rows = dc.read_measurements(mixtures / "t.csv", robot, ["x", "y", "z"], **columns, length="mm", angle="rad")
@@ -146,8 +133,7 @@ def test_set_ups_are_evaluated_each_in_its_place(mixed: Path, command: Command, 
     (tmp_path / "moved.csv").write_text("\n".join([f"{header},day", *map(",".join, cells)]))
     written = []
     for options in ([mixed.with_name("t.csv")], [tmp_path / "moved.csv", "--session", "day"]):
-        done = command("evaluate", mixed, *options, *POSITION, *SOCKETS, *RAD, "--json", tmp_path / "e.json")
-        assert done.code == 0, done.err
+        done = command.ran("evaluate", mixed, *options, *POSITION, *SOCKETS, *RAD, "--json", tmp_path / "e.json")
         written.append(json.loads((tmp_path / "e.json").read_text())["results"])
     assert "the frames of 2 sessions were found from these rows, 12 numbers in all" in " ".join(done.out.split())
     still, placed = written
@@ -172,6 +158,4 @@ def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> 
         ["predict", kind.file, table, *UNITS, *out],
         ["correct", kind.file, table, *UNITS, *out],
     ):
-        refused = command(*words)
-        assert refused.code == 1
-        assert "payload" in refused.error
+        assert "payload" in command.failed(*words)

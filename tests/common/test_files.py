@@ -27,7 +27,7 @@ except InputError as error:
 """
 
 
-def test_replaces_and_keeps_permissions(tmp_path: Path) -> None:
+def test_replaces_whole_files_and_keeps_permissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.csv"
     path.write_bytes(b"old")
     path.chmod(0o640)
@@ -35,9 +35,6 @@ def test_replaces_and_keeps_permissions(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new"
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
-
-
-def test_the_content_is_on_the_disk_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done, fsync, replace = list[str](), os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda file: (done.append("fsync"), fsync(file)))
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
@@ -46,9 +43,7 @@ def test_the_content_is_on_the_disk_before_the_name(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(("number", "written"), [(errno.EINVAL, True), (errno.ENOTSUP, True), (errno.EIO, False)])
-def test_a_file_system_without_fsync_or_locks(
-    number: int, written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_fsync_or_locks(number: int, written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
@@ -86,7 +81,6 @@ with WholeFile(sys.argv[1]) as file:
 
 
 def begun(path: Path) -> subprocess.Popen[str]:
-    """A process that has written half of a file and waits."""
     command = [sys.executable, "-B", "-c", WRITER, str(path)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -128,7 +122,6 @@ def test_a_living_writer_is_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("old", [[], ["a.csv"]])
 def test_ctrl_c_leaves_what_there_was(old: list[str], tmp_path: Path) -> None:
-    """So does every error inside of the block."""
     for name in old:
         (tmp_path / name).write_bytes(b"old")
     with begun(tmp_path / "a.csv") as process:
@@ -138,16 +131,13 @@ def test_ctrl_c_leaves_what_there_was(old: list[str], tmp_path: Path) -> None:
     assert all((tmp_path / name).read_bytes() == b"old" for name in old)
 
 
-def test_several_files_are_written_together_or_not_at_all(tmp_path: Path) -> None:
+def test_a_full_disk_a_missing_folder_and_a_pipe(tmp_path: Path) -> None:
     paths = [tmp_path / "a.c", tmp_path / "a.h"]
     write_together(dict.fromkeys(paths, b"old"))
     with pytest.raises(InputError, match=r"none.*No such file or directory\); make its folder first"):
         write_together({paths[0]: b"new", tmp_path / "none" / "a.h": b"new"})
     assert [path.read_bytes() for path in paths] == [b"old", b"old"]
     assert names(tmp_path) == ["a.c", "a.h"]
-
-
-def test_a_pipe_is_written_directly() -> None:
     read, write = os.pipe()
     write_whole(f"/dev/fd/{write}", b"content")
     os.close(write)

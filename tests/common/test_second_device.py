@@ -77,16 +77,13 @@ def test_flows_and_their_gradients(place: Place, case: Case) -> None:
 
     expected = work(case.kernel.using("dense"), q, a, x)
     with at(place) as name:
-        for one, other in zip(
-            work(case.kernel.to(name).using("dense"), *(t.to(name) for t in (q, a, x))), expected, strict=True
-        ):
+        found = work(case.kernel.to(name).using("dense"), *(t.to(name) for t in (q, a, x)))
+        for one, other in zip(found, expected, strict=True):
             place.compare(one, other)
 
 
 @every_place
-@pytest.mark.parametrize(
-    "name", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in FITS]
-)
+@pytest.mark.parametrize("name", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in QUICK)) for kind in FITS])
 def test_fits(place: Place, name: str) -> None:
     problem, x = rr_problem(2, noise=1e-3) if name == "chosen steps" else rr_problem(3), elastic_rr.grid(3)
     expected = FITS[name](problem)

@@ -17,11 +17,8 @@ from diffeo_calib.common.threads import LARGE_MATRIX, allowed_threads, in_parall
 
 def counts() -> list[int]:
     """Number of threads of every OpenBLAS of NumPy and SciPy."""
-    return [
-        one["num_threads"]
-        for one in threadpool_info()
-        if one["internal_api"] == "openblas" and "/torch" not in one["filepath"]
-    ]
+    pools = [one for one in threadpool_info() if "/torch" not in one["filepath"]]
+    return [one["num_threads"] for one in pools if one["internal_api"] == "openblas"]
 
 
 def test_one_thread_inside_and_as_many_as_before_outside() -> None:
@@ -37,7 +34,7 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
     assert 2 in before
 
 
-def test_small_work_has_one_thread_and_large_work_inside_has_all() -> None:
+def test_small_and_large_work_and_the_setting_afterwards() -> None:
     with torch_threads(3):
         with small_work():
             assert torch.get_num_threads() == 1
@@ -48,9 +45,6 @@ def test_small_work_has_one_thread_and_large_work_inside_has_all() -> None:
                 assert torch.get_num_threads() == 1
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 3
-
-
-def test_the_setting_is_restored_after_an_error() -> None:
     with torch_threads(3):
         with pytest.raises(KeyboardInterrupt), small_work(), large_work(LARGE_MATRIX):
             raise KeyboardInterrupt

@@ -46,7 +46,6 @@ def camera_of(model: dc.CalibratedKinematics) -> BoardCamera:
 
 
 def check(known: KnownPose, place: Any, turn: Tensor | None = None) -> None:
-    """The true place within 4 standard deviations, and they are no excuse."""
     away = known.pose[:3, 3] - torch.tensor(place, dtype=torch.float64)
     assert bool((away.abs() < 4 * known.deviations[:3]).all())
     assert float(known.deviations[:3].max()) < 2e-3
@@ -55,22 +54,17 @@ def check(known: KnownPose, place: Any, turn: Tensor | None = None) -> None:
         assert bool((torch.from_numpy(small).abs() < 4 * known.deviations[3:]).all())
 
 
-def test_a_camera_on_the_tool_is_where_it_is() -> None:
+def test_cameras_are_where_they_are() -> None:
     found = HandEye.of(on_tool())
     check(found.camera, CAMERA[:3], rotation(torch.tensor(CAMERA[3:], dtype=torch.float64)))
     assert set(found.entry()) == {"camera_in_tip", "board_in_base"}
     assert camera_of(on_tool()).on_tool
-
-
-def test_a_fixed_camera_is_where_it_is() -> None:
     found = HandEye.of(fixed(), camera_on_tool=False)
     check(found.camera, FIXED_CAMERA[0])
     check(found.board, BOARD_ON_FLANGE, torch.eye(3, dtype=torch.float64))
     assert found.camera.link == fixed().robot.base
     assert not camera_of(fixed()).on_tool
-    assert any(
-        "camera in the robot's base (hand-eye transform)" in line for line in hand_eye_sentences({"camera": found})
-    )
+    assert "camera in the robot's base (hand-eye transform)" in "\n".join(hand_eye_sentences({"camera": found}))
 
 
 @pytest.mark.parametrize("model", [on_tool, fixed])
@@ -114,11 +108,9 @@ def test_opencv_reads_the_files(tmp_path: Path) -> None:
 
 def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     kind, folder = kind_named("images of a board"), tmp_path / "camera"
-    done = command("export", kind.file, "--camera", folder)
-    assert done.code == 0, done.err
+    command.ran("export", kind.file, "--camera", folder)
     assert {path.name for path in folder.iterdir()} == set(camera_files(on_tool()))
-    rigid = command("export", kind.file, "--camera", folder, "--urdf", tmp_path / "a.urdf", "--robot", kind.urdf)
-    assert rigid.code == 0, rigid.err
+    rigid = command.ran("export", kind.file, "--camera", folder, "--urdf", tmp_path / "a.urdf", "--robot", kind.urdf)
     assert "the rigid kinematics" in rigid.out
     other = (folder / "hand_eye.yaml").read_text()
     assert other != camera_files(on_tool())["hand_eye.yaml"]
@@ -131,7 +123,7 @@ def test_the_command_writes_them(command: Command, tmp_path: Path) -> None:
     assert "expected one that saw a board, got none" in wrong.error
 
 
-def test_what_explains_the_errors_adds_up() -> None:
+def test_what_explains_the_errors_and_models_of_earlier_versions() -> None:
     own = camera_of(on_tool()).explained
     parts = [own.arm, own.lens, own.board, own.corners]
     assert abs(sum(part**2 for part in parts) ** 0.5 / own.nominal - 1) < 1e-9
@@ -140,9 +132,6 @@ def test_what_explains_the_errors_adds_up() -> None:
     assert 0 < own.board_std < own.corners
     lines = "\n".join(on_tool().placement[0].sentences())
     assert f"arm {1e3 * own.arm:.3f}" in lines
-
-
-def test_models_of_earlier_versions_have_lens_and_board_alone() -> None:
     placed = on_tool().placement[0]
     old = replace(placed, constants=camera_of(on_tool()).camera.unknowns[None])
     assert not old.cameras

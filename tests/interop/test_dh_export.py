@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.cli.commands.export import HASH
+from diffeo_calib.cli.commands.correct import HASH
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.dh import dh_table, write_dh, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
@@ -186,21 +186,18 @@ def their_poses(links: dict[str, list[float]], q: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.05])
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_path: Path) -> None:
-    """Of any tip beyond the last joint."""
     robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
     tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
     zero = torch.zeros(1, 6, dtype=torch.float64)
-    for tip, rest in (
-        (tool, torch.eye(4, dtype=torch.float64)),
-        (robot, torch.linalg.inv(tool(zero)[0]) @ robot(zero)[0]),
-    ):
+    flange = torch.linalg.inv(tool(zero)[0])
+    for tip, rest in ((tool, flange @ tool(zero)[0]), (robot, flange @ robot(zero)[0])):
         geometry, q = wrong(tip, size), configurations(tip)
         write_ur_kinematics(geometry, tmp_path / "ur.yaml")
         links, _ = read_yaml(tmp_path / "ur.yaml")
         torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
 
 
-def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
+def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
     geometry = Geometry.nominal(load(tmp_path / "ur.urdf", urdf()))
     write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash="calib_4890363623803256388")
     assert read_yaml(tmp_path / "ur.yaml")[1] == "calib_4890363623803256388"
@@ -210,10 +207,7 @@ def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
     for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
         with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
             write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)
-
-
-def test_other_robots_are_refused(tmp_path: Path) -> None:
-    new, path = tmp_path / "ur.yaml", tmp_path / "ur.urdf"
+    new, path = tmp_path / "new.yaml", tmp_path / "ur.urdf"
     with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
         write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)
     text = urdf()

@@ -22,7 +22,6 @@ MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="
 
 
 def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
-    """Poses (N, 4, 4) of the first tip as MuJoCo has them."""
     data, found = mujoco.MjData(model), torch.eye(4, dtype=torch.float64).repeat(len(q), 1, 1)
     for row, values in enumerate(chain.moving_values(q).numpy()):
         for name, value in zip(chain.moving_names, values, strict=True):
@@ -35,7 +34,6 @@ def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
 
 
 def inertia(body: Any) -> np.ndarray:
-    """(3, 3) about the centre of mass, in the body's axes, kg m^2."""
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, body.iquat)
     return R.reshape(3, 3) @ np.diag(body.inertia) @ R.reshape(3, 3).T
@@ -55,7 +53,7 @@ def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Pat
             np.testing.assert_allclose(model.eq_data[0, :2], [joint.mimic_offset, *joint.mimic.values()])
 
 
-def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> None:
+def test_limits_masses_inertias_and_names(tmp_path: Path) -> None:
     arm = SimulatedArm(seed=0)
     arm.write_urdf(tmp_path / "arm.urdf")
     text = (tmp_path / "arm.urdf").read_text()
@@ -72,9 +70,6 @@ def test_limits_masses_and_inertias_are_those_of_the_urdf(tmp_path: Path) -> Non
         np.testing.assert_allclose(here.mass, there.mass)
         np.testing.assert_allclose(here.ipos, there.ipos, atol=1e-12)
         np.testing.assert_allclose(inertia(here), inertia(there), rtol=0, atol=1e-9)
-
-
-def test_a_robot_without_a_urdf_has_bodies_named_after_joints() -> None:
     robot = dc.from_dh([(0.3, 0.0, 0.1), (0.2, 0.4, 0.0)], "standard", names=["a", "b"])
     model = mujoco.MjModel.from_xml_string(mjcf_text(wrong(robot)))
     assert {"a", "b"} <= {model.body(number).name for number in range(model.nbody)}

@@ -1,15 +1,13 @@
-"""Model files: exact round trips of robots, functions, kernels and coarse models; the contents of the header.
-
-Read by NumPy alone, against the torch model of the same file; and files that earlier versions wrote: those in data/
-were written at commit 29d55d1, before the package had its present folders and names.
-
-Where a model comes from, and its summary: kept by every copy, saved and loaded, from files of every age.
-"""
+"""Model files: round trips, contents, files of earlier versions; damaged and edited ones are refused by a sentence."""
 
 import hashlib
 import json
+import os
+import pickle
+import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from math import inf
@@ -22,13 +20,16 @@ import pytest
 import torch
 from deformation_bank import model_of
 from math_bank import constant_kernel
-from model_file_bank import planar
+from model_file_bank import Editor, planar, refused, set_entry, set_tensor
 from product_bank import Case
 from robots_bank import CHAINS, draw
+from safetensors.torch import save_file
+from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop import model_file
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kinematics.provenance import Provenance
@@ -39,7 +40,6 @@ from diffeo_calib.robots.se3 import twist_transform
 
 
 def test_robot_models_come_back_bit_for_bit(arm: Case, tmp_path: Path) -> None:
-    """Of the other kinds: tests/test_laws_of_kinds.py."""
     model, q = arm.model, arm.test.q[:50]
     dc.save(model, tmp_path / "model.safetensors")
     again = dc.load(tmp_path / "model.safetensors")
@@ -123,7 +123,7 @@ def test_same_values_as_the_torch_model(name: str, waves: bool, tmp_path: Path) 
         np.testing.assert_allclose(found.tool_jacobian(q, [0.1, 0.2, 0.3], frame), slopes, rtol=0, atol=1e-9)
 
 
-def test_loads_no_torch(tmp_path: Path) -> None:
+def test_models_without_torch(tmp_path: Path) -> None:
     dc.save(model_of(CHAINS["arm"]), tmp_path / "model.safetensors")
     code = (
         "import sys; from diffeo_calib.interop.numpy_model import load_numpy; "
@@ -131,9 +131,6 @@ def test_loads_no_torch(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n")[0] == "(1, 2, 3) False"
-
-
-def test_models_that_need_torch(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     dc.save(planar().model, path)
     with pytest.raises(InputError, match=r"expected that of a robot.*use `dc.load`"):
@@ -144,7 +141,6 @@ def test_models_that_need_torch(tmp_path: Path) -> None:
 
 
 def test_arguments(tmp_path: Path) -> None:
-    """Data frames are taken by the names of their columns."""
     path, chain = tmp_path / "model.safetensors", CHAINS["arm"]
     dc.save(model_of(chain), path)
     model, q = load_numpy(path), draw(2, chain.n, seed=5).numpy()
@@ -179,7 +175,7 @@ def expected() -> dict[str, Any]:
     return json.loads((DATA / "format_3.json").read_text(encoding="utf-8"))
 
 
-def test_a_robot(expected: dict[str, Any], tmp_path: Path) -> None:
+def test_old_files(expected: dict[str, Any], tmp_path: Path) -> None:
     model, said = dc.load(DATA / "robot_format_3.safetensors"), expected["robot"]
     assert isinstance(model, dc.CalibratedKinematics)
     for found, value in zip(model.predict(said["q"]), (said["mean"], said["covariance"]), strict=True):
@@ -192,25 +188,19 @@ def test_a_robot(expected: dict[str, Any], tmp_path: Path) -> None:
     assert model.report == said["report"]
     assert model.summary is not None
     assert model.summary.rows == 20
-
-
-def test_a_map_with_control_points(expected: dict[str, Any]) -> None:
     model, said = dc.load(DATA / "map_format_3.safetensors", elastic_rr.nominal), expected["map"]
     x, y = (torch.tensor(said[name], dtype=torch.float64) for name in ("x", "y"))
     torch.testing.assert_close(model(x), y, rtol=0, atol=1e-13)
     assert len(model.x) == 16  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_calibration_says_when_and_from_what(arm: Case) -> None:
+def test_where_a_calibration_comes_from(arm: Case, tmp_path: Path) -> None:
     found = arm.model.provenance
     assert found is not None
     made = datetime.fromisoformat(found.date)
     assert made.tzinfo == timezone.utc
     assert timedelta(0) <= datetime.now(timezone.utc) - made < timedelta(days=1)
     assert (found.version, found.table_sha256, found.note) == (dc.__version__, arm.train.sha256, "")
-
-
-def test_every_copy_and_file_keeps_it(arm: Case, tmp_path: Path) -> None:
     provenance = Provenance("2026-11-22T10:00:00+00:00", "0.1.0", "ab" * 32, "serial 17")
     summary = replace(arm.model.summary, noise_degrees_of_freedom=inf, effective_parameters=None)
     model = dc.CalibratedKinematics(arm.robot, arm.model.map, summary, tool=[0, 0, 0.1], provenance=provenance)
@@ -241,3 +231,164 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
     shifted = dc.Measurements(data.q, data.points + 1e-12)
     others = (shifted, arrays.rows(slice(1, None)), dc.Measurements(data.q, data.points, std=1e-5))
     assert len({arrays.sha256, of_the_file, *(other.sha256 for other in others)}) == 5
+
+
+def test_cut_short_or_flipped(sound: bytes, tmp_path: Path) -> None:
+    path, start = tmp_path / "cut.safetensors", 8 + struct.unpack("<Q", sound[:8])[0]
+    for length in [*range(64), *range(64, len(sound), 307), len(sound) - 8, len(sound) - 1]:
+        path.write_bytes(sound[:length])
+        assert "copy or save it again" in refused(path), length
+    flipped = (sound[:k] + bytes([sound[k] ^ 32]) + sound[k + 1 :] for k in range(start, len(sound), 101))
+    for other in (sound + b"\0", *flipped):
+        path.write_bytes(other)
+        refused(path)
+
+
+def test_files_of_other_kinds_are_not_unpickled(tmp_path: Path) -> None:
+    path, weight = tmp_path / "other", {"weight": torch.zeros(3)}
+    assert "there is no model file" in refused(path)
+    assert "there is no model file" in refused(tmp_path)
+    png = b"\x89PNG\r\n\x1a\n" + bytes(100)
+    for content in (b"", b"robot: ur10\n", png, pickle.dumps({"model": 1}), bytes([255] * 8)):
+        path.write_bytes(content)
+        assert "cannot be read as a model file" in refused(path)
+    header = json.dumps({"format": model_file.FORMAT})
+    for metadata, message in (
+        (None, "is not a diffeo_calib model"),
+        ({"format": "pt"}, "is not a diffeo_calib model"),
+        *(({model_file.ENTRY: text}, "is not a diffeo_calib model") for text in ("[]", "null", "3", '"model"')),
+        *(({model_file.ENTRY: text}, "cannot be read") for text in ("{", "[" * 100_000)),
+        ({model_file.ENTRY: "{}"}, "format version None"),
+        ({model_file.ENTRY: header}, "checksum"),
+    ):
+        save_file(weight, path, metadata=metadata)
+        assert message in refused(path)
+    save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path, metadata={model_file.ENTRY: header})
+    refused(path)
+
+    class Trap:
+        def __reduce__(self) -> tuple[Any, tuple[str]]:
+            return (Path.touch, (Path(tmp_path / "executed"),))  # pyright: ignore[reportReturnType]
+
+    torch.save({"model": Trap()}, tmp_path / "trap.pt")
+    (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap()))
+    for name in ("trap.pt", "trap.pkl"):
+        refused(tmp_path / name)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("what", [3, "model", None, torch.zeros(3)])
+def test_only_models_are_saved(what: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"`model`: expected a calibrated model, got .*result.model"):
+        dc.save(what, tmp_path / "model")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("where", ["fsync", "replace"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failing_save(where: str, error: Any, editor: Editor, sound: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = dc.load(editor.path)
+
+    def fail(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(os, where, fail)
+    expected = InputError if isinstance(error, OSError) else KeyboardInterrupt
+    with pytest.raises(expected, match="No space left.*free some space" if isinstance(error, OSError) else None):
+        dc.save(model, editor.path)
+    assert editor.path.read_bytes() == sound
+    assert [path.name for path in editor.path.parent.iterdir()] == [editor.path.name]
+
+
+def test_an_edit_needs_a_new_checksum(editor: Editor) -> None:
+    edit = set_entry("report", "rows", value=10)
+    assert "damaged or edited: its checksum does not match" in refused(editor.write(edit, sign=False))
+    model = dc.load(editor.write(edit))
+    assert isinstance(model, dc.CalibratedKinematics)
+    assert model.report["rows"] == 10
+
+
+WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
+    "other format": (("format",), 1, "format version 1: expected 3; read it with the version that wrote it"),
+    "extra entry": (("surprise",), 1, "header of the model file is not understood"),
+    "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
+    "kernel option": (("joint_kernel", 0, "surprise"), 1, "do not fit together"),
+    "negative length": (("joint_kernel", 0, "lengthscale"), -1.0, "positive"),
+    "kernel of another joint": (("joint_kernel", 0, "columns"), [6], "6 coordinates"),
+    "no steps": (("integrator", "steps"), 0, "at least 1"),
+    "unknown integrator": (("integrator", "kind"), "euler", "euler"),
+    "dimension of the plane": (("task_dim",), 2, "task_dim"),
+    "lever of a model of points": (("lever",), 0.1, "a model of poses: expected three points for each, got 1"),
+    "other kind": (("nominal", "kind"), "planet", "robot or function"),
+    "no joints": (("nominal", "joints"), [], "no moving joint"),
+    "axis of length zero": (("nominal", "joints", 0, "axis"), [0, 0, 0], "axis of joint 'waist_joint'"),
+    "origin not rigid": (("nominal", "joints", 0, "origin"), np.diag([2.0, 1, 1, 1]).tolist(), "rigid"),
+    "unknown joint": (("nominal", "joints", 0, "kind"), "ball", "kind of joint"),
+    "one joint less": (("nominal", "joints", 0, "kind"), "fixed", "joint_errors"),
+    "mimic of no joint": (("nominal", "joints", 0, "mimic"), {"nose": 1.0}, "mimics 'nose'"),
+    "one active joint less": (("nominal", "joints", 1, "mimic"), {"waist_joint": 1.0}, "must have shape (N, 5)"),
+    "elastic of a word": (("nominal", "elastic"), "no", "the entry elastic: expected true or false, got no"),
+    "command of a number": (("provenance", "command"), 5, "the entry 'command' is 5"),
+    "urdf of a list": (("urdf",), ["<robot/>"], "the entry urdf: expected the text of a file, got list"),
+    "negative payload": (("nominal", "payload"), {"mass": -1.0, "unit": 2.0}, "mass of the payload: expected a number"),
+    "wave of no joint": (("nominal", "waves"), [[6, 3.0]], "gear waves: expected joints below 6, positive frequencies"),
+    "axis of many terms": (("nominal", "axes"), [[0, -1.0, 1.0, 10**9]], "errors of axes: expected joints below 6"),
+    "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_ENTRIES)
+def test_wrong_entries(name: str, editor: Editor) -> None:
+    keys, value, message = WRONG_ENTRIES[name]
+    assert message in refused(editor.write(set_entry(*keys, value=value)))
+
+
+NOT_UNDERSTOOD = ("units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever")
+MISSING: dict[str, Callable[[Any, Any], object]] = {
+    **{k: lambda header, _, k=k: header.pop(k) for k in NOT_UNDERSTOOD},
+    **{k: lambda header, _, k=k: header["nominal"]["joints"][0].pop(k) for k in ("lower", "mimic", "mimic_offset")},
+    "elastic": lambda header, _: header["nominal"].pop("elastic"),
+    **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_file.MOMENTA, *model_file.GEOMETRY)},
+}
+"""Entries of the header, of a joint and of elasticity, and tensors."""
+
+
+@pytest.mark.parametrize("name", MISSING)
+def test_missing_parts(name: str, editor: Editor) -> None:
+    expected = "not understood" if name in NOT_UNDERSTOOD else f"do not fit together ('{name}')"
+    assert expected in refused(editor.write(MISSING[name]))
+
+
+WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
+    "base not rigid": ("base", lambda t: -t),
+    "no markers": ("tool", lambda t: t[:0]),
+    "one joint error less": ("joint_errors", lambda t: t[:-1]),
+    "configurations not finite": ("x", lambda t: t * float("nan")),
+    "noise negative": ("noise", lambda t: -t),
+    "new noise negative": ("new_noise", lambda t: -t),
+    "new noise not symmetric": ("new_noise", lambda t: t + 0.1 * t.max() * torch.ones_like(t).triu(1)),
+    "one elastic prior less": ("prior_variance", lambda t: t[:-1]),
+    "one row less in x": ("x", lambda t: t[:-1]),
+    "parameters of a million metres": ("theta", lambda t: t + 2e6),
+    "rigid errors of other joints": ("rigid_errors", lambda t: t[:2]),
+    "integers": ("noise", lambda t: t.long()),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_TENSORS)
+def test_wrong_tensors(name: str, editor: Editor) -> None:
+    assert "do not fit together" in refused(editor.write(set_tensor(*WRONG_TENSORS[name])))
+
+
+@pytest.mark.parametrize("steps", [0, 0.5, True, 10**5, 10**30])
+def test_the_reader_without_torch_bounds_the_time_steps(steps: object, editor: Editor) -> None:
+    """Its work grows with them: 10^5 steps would take minutes."""
+    with pytest.raises(ModelFileError, match="the time steps: expected 1 to 1024"):
+        dc.interop.load_numpy(editor.write(set_entry("integrator", "steps", value=steps)))
+
+
+def test_a_forged_flow_has_no_predictions(editor: Editor) -> None:
+    """With so large a variance its flow folds or its numbers overflow: rounding decides, and so what the error says."""
+    folding = editor.write(set_entry("joint_kernel", 0, "variance", value=1e4))
+    with pytest.raises(dc.DiffeoCalibError):
+        dc.load(folding).predict(torch.zeros(3, 6, dtype=torch.float64, device="cpu"))

@@ -16,14 +16,8 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import with_joint_offsets
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.rigid import (
-    GEOMETRIC,
-    PROJECTION,
-    best_joint_offsets,
-    joint_motion,
-    rigid_kinematics,
-    with_errors,
-)
+from diffeo_calib.interop import rigid as found_rigid
+from diffeo_calib.interop.rigid import GEOMETRIC, PROJECTION, best_joint_offsets, rigid_kinematics, with_errors
 from diffeo_calib.interop.tables import correction_tables, write_correction_tables, write_joint_offsets
 from diffeo_calib.robots import Geometry
 
@@ -33,26 +27,15 @@ def rms(points: Tensor, others: Tensor) -> float:
 
 
 def test_a_rigid_model_is_found_again(arm: Case) -> None:
-    """Where nothing but joint errors deforms the robot, rigid kinematics lose nothing, at other configurations too."""
-    model = rigid_model(arm.model, wrong(arm.robot, size=1e-3))
-    found = rigid_kinematics(model)
-    assert (found.how, list(found.validated)) == (PROJECTION, [PROJECTION])
-    assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
-    assert found.rms <= found.largest < 1e-8
-    assert found.validated[PROJECTION] < 1e-7
-
-
-def test_the_geometric_calibration_is_taken_where_it_is_better(arm: Case) -> None:
-    """The model has 60 poses: joint errors that are exactly the model's beat those that are estimated."""
-    truth = wrong(arm.robot, size=1e-3)
-    model = rigid_model(arm.model, truth)
-    for errors, how in ((truth.joint_errors, GEOMETRIC), (wrong(arm.robot, size=2e-3).joint_errors, PROJECTION)):
-        given = dc.CalibratedKinematics(model.robot, model.map, rigid_errors=errors)
-        found = rigid_kinematics(given)
-        assert found.how == how
-        assert set(found.validated) == {GEOMETRIC, PROJECTION}
-        assert found.validated[how] == min(found.validated.values())
+    """Nothing is lost, at other configurations too; exact joint errors beat those that are estimated of 60 poses."""
+    truth, other = (wrong(arm.robot, size=size).joint_errors for size in (1e-3, 2e-3))
+    model, both = rigid_model(arm.model, wrong(arm.robot, size=1e-3)), {GEOMETRIC, PROJECTION}
+    for errors, how, ways in ((None, PROJECTION, {PROJECTION}), (truth, GEOMETRIC, both), (other, PROJECTION, both)):
+        found = rigid_kinematics(dc.CalibratedKinematics(model.robot, model.map, rigid_errors=errors))
+        assert (found.how, set(found.validated)) == (how, ways)
+        assert found.validated[how] == min(found.validated.values()) < 1e-7
         assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
+        assert found.rms <= found.largest < 1e-8
 
 
 def test_the_projection_is_a_minimum_and_its_numbers_are_those_of_the_geometry(arm: Case) -> None:
@@ -108,8 +91,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_corrected_command_brings_the_joint_to_its_value(arm: Case) -> None:
-    """The model's own transmission error, to rounding: command + error(command) = wanted value."""
+def test_correction_tables(arm: Case) -> None:
     for table in correction_tables(arm.model):
         command = table.values + table.corrections
         reached = command + arm.model.transmission(table.joint, command)
@@ -117,22 +99,6 @@ def test_the_corrected_command_brings_the_joint_to_its_value(arm: Case) -> None:
         torch.testing.assert_close(table.errors, arm.model.transmission(table.joint, table.values), rtol=0, atol=0)
         away = (table.corrections + table.errors).abs().max()
         assert float(away) < 0.01 * float(table.errors.abs().max()) + 1e-9, "it is minus the error, to first order"
-
-
-def test_files_hold_tables_and_offsets_in_degrees(arm: Case, tmp_path: Path) -> None:
-    write_correction_tables(arm.model, tmp_path / "t.csv", angle="deg")
-    write_joint_offsets(arm.model, tmp_path / "o.csv", angle="deg")
-    for table in correction_tables(arm.model):
-        own = [row for row in read(tmp_path / "t.csv") if row["joint"] == table.joint]
-        written = [[float(row[name]) for name in ("value", "transmission_error", "correction_to_add")] for row in own]
-        assert {row["unit"] for row in own} == {"deg"}
-        expected = torch.stack([table.values, table.errors, table.corrections], 1)
-        torch.testing.assert_close(torch.tensor(written, dtype=torch.float64).deg2rad(), expected, rtol=1e-14, atol=0)
-    found = [math.radians(float(row["offset_to_add_to_reading"])) for row in read(tmp_path / "o.csv")]
-    assert found == pytest.approx(best_joint_offsets(arm.model).offsets.tolist(), rel=1e-14)
-
-
-def test_tables_cover_what_was_measured_and_say_how_good_interpolation_is(arm: Case) -> None:
     measured = arm.model.configurations
     for index, table in enumerate(correction_tables(arm.model, turn_step=0.1)):
         low, high = float(table.values[0]), float(table.values[-1])
@@ -148,12 +114,25 @@ def test_tables_cover_what_was_measured_and_say_how_good_interpolation_is(arm: C
         assert 0.5 * table.between < away < 1.5 * table.between + 1e-12
 
 
+def test_files_hold_tables_and_offsets_in_degrees(arm: Case, tmp_path: Path) -> None:
+    write_correction_tables(arm.model, tmp_path / "t.csv", angle="deg")
+    write_joint_offsets(arm.model, tmp_path / "o.csv", angle="deg")
+    for table in correction_tables(arm.model):
+        own = [row for row in read(tmp_path / "t.csv") if row["joint"] == table.joint]
+        written = [[float(row[name]) for name in ("value", "transmission_error", "correction_to_add")] for row in own]
+        assert {row["unit"] for row in own} == {"deg"}
+        expected = torch.stack([table.values, table.errors, table.corrections], 1)
+        torch.testing.assert_close(torch.tensor(written, dtype=torch.float64).deg2rad(), expected, rtol=1e-14, atol=0)
+    found = [math.radians(float(row["offset_to_add_to_reading"])) for row in read(tmp_path / "o.csv")]
+    assert found == pytest.approx(best_joint_offsets(arm.model).offsets.tolist(), rel=1e-14)
+
+
 @pytest.mark.slow
 def test_rigid_kinematics_made_for_the_tables_are_better_with_them(arm: Case) -> None:
     """On poses that were not fitted: nominal > rigid alone > rigid with tables > rigid made for tables."""
     model, test = arm.model, arm.test
     alone, made = rigid_kinematics(model), rigid_kinematics(model, transmission=True)
-    moved = dc.Measurements(joint_motion(model, test.q), test.points)
+    moved = dc.Measurements(found_rigid.joint_motion(model, test.q), test.points)
     errors = [
         dc.evaluate(with_errors(model, None).geometry.points, test).rms,
         dc.evaluate(alone.geometry.points, test).rms,

@@ -10,9 +10,10 @@ from product_bank import Case
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.utils.estimator_checks import check_estimator
+from table_bank import refused
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 
 JOINTS = "fits a random table of other columns than the robot's six joints"
 OTHER_TABLES = (
@@ -41,9 +42,8 @@ def fitted(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> Any:
 
 def test_the_checks_of_scikit_learn(arm: Case) -> None:
     reasons = dict.fromkeys(OTHER_TABLES, JOINTS)
-    found = check_estimator(
-        dc.interop.DiffeoRegressor(arm.robot), expected_failed_checks=reasons, on_skip=None, on_fail=None
-    )
+    estimator = dc.interop.DiffeoRegressor(arm.robot)
+    found = check_estimator(estimator, expected_failed_checks=reasons, on_skip=None, on_fail=None)
     failed = [one["check_name"] for one in found if one["status"] == "failed"]
     assert failed == []
     assert {one["check_name"] for one in found if one["status"] == "xfail"} == set(reasons)
@@ -90,7 +90,6 @@ def test_data_frames_by_name(arm: Case, fitted: Any, table: tuple[np.ndarray, np
 
 
 def with_scales(arm: Case) -> dc.interop.DiffeoRegressor:
-    """An estimator that need not search for its scales."""
     return dc.interop.DiffeoRegressor(arm.robot, hyperparameters=arm.result.selection.scales)
 
 
@@ -99,14 +98,12 @@ def test_bad_arguments(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
     make = dc.interop.DiffeoRegressor
     with pytest.raises(NotFittedError):
         make(arm.robot).predict(q)
-    with pytest.raises(InputError, match="robot"):
-        make().fit(q, y)
-    with pytest.raises(MeasurementError, match="6 joints"):
-        make(arm.robot).fit(q[:, :4], y)
-    with pytest.raises(MeasurementError, match=r"3 P"):
-        make(arm.robot).fit(q, y[:, :2])
-    with pytest.raises(MeasurementError, match="devices whose places are found from all rows"):
-        make(arm.robot).fit(q, y[:, 0])
+    refused(
+        ("robot", lambda: make().fit(q, y)),
+        ("6 joints", lambda: make(arm.robot).fit(q[:, :4], y)),
+        (r"3 P", lambda: make(arm.robot).fit(q, y[:, :2])),
+        ("devices whose places are found from all rows", lambda: make(arm.robot).fit(q, y[:, 0])),
+    )
     bad = q.copy()
     bad[3, 2] = np.nan
     with pytest.raises(ValueError, match="NaN"):

@@ -95,27 +95,17 @@ def test_angles_of_an_origin_are_exact_also_where_they_are_ambiguous(lever: floa
 
 def test_a_model_brings_its_own_urdf(tmp_path: Path) -> None:
     """Byte for byte, whatever they are. Of its rigid kinematics: tests/cli/test_export_command.py."""
-    chain = write_ugly(
-        tmp_path / "robot.urdf", UGLY.replace('utf-8"', 'iso-8859-1"').replace("-->", "\xff -->"), "latin-1"
-    )
+    text = UGLY.replace('utf-8"', 'iso-8859-1"').replace("-->", "\xff -->")
+    chain = write_ugly(tmp_path / "robot.urdf", text, "latin-1")
     dc.save(model_of(chain), tmp_path / "model.safetensors")
     model: Any = dc.load(tmp_path / "model.safetensors")
     assert urdf_of(model.robot) == (tmp_path / "robot.urdf").read_bytes()
     write_urdf(wrong(model.robot), tmp_path / "new.urdf")
-    q = configurations(chain)
-    torch.testing.assert_close(
-        dc.load_urdf(tmp_path / "new.urdf", *UGLY_ENDS)(q), own_poses(wrong(chain), q), rtol=0, atol=1e-12
-    )
+    q, again = configurations(chain), dc.load_urdf(tmp_path / "new.urdf", *UGLY_ENDS)
+    torch.testing.assert_close(again(q), own_poses(wrong(chain), q), rtol=0, atol=1e-12)
 
 
-def test_a_robot_without_urdf(tmp_path: Path) -> None:
-    chain = dc.from_dh([(0.1, 0.2, 0.3), (0.1, 0, 0)])
-    with pytest.raises(InputError, match=r"'robot' does not hold the URDF that it was fitted with; pass the file"):
-        write_urdf(wrong(chain), tmp_path / "new.urdf")
-    assert not (tmp_path / "new.urdf").exists()
-
-
-def test_another_urdf_must_describe_the_same_robot(tmp_path: Path) -> None:
+def test_files_that_are_not_of_the_robot(tmp_path: Path) -> None:
     chain, path, new = write_ugly(tmp_path / "robot.urdf"), tmp_path / "other.urdf", tmp_path / "new.urdf"
     commented = UGLY.replace("<!-- end -->", "<!-- serial number 7 -->")
     path.write_text(commented, encoding="utf-8")
@@ -136,6 +126,13 @@ def test_another_urdf_must_describe_the_same_robot(tmp_path: Path) -> None:
             write_urdf(wrong(chain), new, robot=path)
     with pytest.raises(RobotError, match="there is no file"):
         write_urdf(wrong(chain), new, robot=tmp_path / "none.urdf")
+    chain = dc.from_dh([(0.1, 0.2, 0.3), (0.1, 0, 0)])
+    with pytest.raises(InputError, match=r"'robot' does not hold the URDF that it was fitted with; pass the file"):
+        write_urdf(wrong(chain), tmp_path / "none.urdf")
+    assert not (tmp_path / "none.urdf").exists()
+    chain = write_ugly(tmp_path / "robot.urdf", UGLY.replace('name="grip"', 'name="pan"'))
+    with pytest.raises(RobotError, match=r"joint 'pan' in the URDF of .*: expected one <joint> with this name, got 2"):
+        write_urdf(wrong(chain), tmp_path / "new.urdf")
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le"])
@@ -143,10 +140,4 @@ def test_texts_of_two_bytes_per_letter_are_refused(encoding: str, tmp_path: Path
     text = UGLY.replace('encoding="utf-8"', 'encoding="utf-16"')
     chain = write_ugly(tmp_path / "robot.urdf", "\ufeff" * (encoding != "utf-16") + text, encoding)
     with pytest.raises(RobotError, match="save the file in UTF-8"):
-        write_urdf(wrong(chain), tmp_path / "new.urdf")
-
-
-def test_two_joints_with_one_name(tmp_path: Path) -> None:
-    chain = write_ugly(tmp_path / "robot.urdf", UGLY.replace('name="grip"', 'name="pan"'))
-    with pytest.raises(RobotError, match=r"joint 'pan' in the URDF of .*: expected one <joint> with this name, got 2"):
         write_urdf(wrong(chain), tmp_path / "new.urdf")

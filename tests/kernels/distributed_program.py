@@ -22,13 +22,11 @@ COUNT, ROWS = 300, 200
 
 
 def everything_shared() -> None:
-    """Share small sums too."""
     backends.BACKENDS["distributed"] = distributed.Distributed(smallest=1)
     control_points.SHARED_ENTRIES = 1
 
 
 def sums(backend: backends.Backend) -> list[Tensor]:
-    """All formulas, of points with themselves and with others."""
     found: list[Tensor] = []
     for formula, rows in product(FORMULAS.values(), (None, points(ROWS, 2))):
         found += backends.evaluate(formula, MaternProfile(2.5), rows, points(COUNT, 1), backend)
@@ -49,7 +47,6 @@ def fits(backend: backends.Backend) -> list[Tensor]:
 
 
 def agree(folder: Path) -> None:
-    """Write the results of all work, and those of one process."""
     everything_shared()
     found: dict[str, Any] = {make.__name__: make("distributed") for make in (sums, fits)}
     found["alone"] = {make.__name__: make("dense") for make in (sums, fits)}

@@ -17,7 +17,6 @@ NAME, STRANGER = "fused", 54321
 
 @pytest.fixture(autouse=True)
 def _new(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """As in a new process."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     _forget()
     yield
@@ -38,7 +37,6 @@ def kept(folder: Path) -> Path:
 
 
 def passing(place: Path | str) -> None:
-    """Assert that this process has a folder of its own, and says so once."""
     with pytest.warns(DiffeoCalibWarning, match="for this run only: '[^']*diffeo_calib' is no folder") as caught:
         found = cache_folder.cache_folder(NAME)
     assert len(caught) == 1
@@ -95,16 +93,13 @@ def test_a_folder_that_others_can_write_to_or_own_is_not_used(case: str, tmp_pat
 
 @pytest.mark.parametrize("case", SAFE)
 def test_a_folder_that_nobody_else_can_replace_is_used(case: str, tmp_path: Path) -> None:
-    """As /tmp is."""
     own = kept(tmp_path / "cache")
     SAFE[case](own)
     assert cache_folder.cache_folder(NAME) == own.resolve()
 
 
 @pytest.mark.parametrize("home", ["", "relative"])
-def test_without_a_home_nothing_is_written_into_the_current_folder(
-    home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_home(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", home)
     monkeypatch.setenv("XDG_CACHE_HOME", "relative too")

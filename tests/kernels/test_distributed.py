@@ -21,11 +21,8 @@ from diffeo_calib.kernels.reductions.tiled import Tiled
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("distributed_program.py")
-ENVIRONMENT = {
-    **os.environ,
-    "OMP_NUM_THREADS": "1",
-    "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("", "tests/banks", "benchmarks/paper_arm")),
-}
+PATHS = os.pathsep.join(str(ROOT / name) for name in ("", "tests/banks", "benchmarks/paper_arm"))
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATHS}
 PATIENCE = 280.0
 
 
@@ -88,14 +85,12 @@ def test_shares_add_up(count: int, formula: Formula) -> None:
             torch.testing.assert_close(compiled.results(total, len(at.features)), expected, rtol=1e-12, atol=1e-10)
 
 
-def test_one_process_needs_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_ranks_refuse(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"several processes: got no RANK, .* start it with `torchrun"):
         backends.evaluate(FIELD, GaussianProfile(), *apart(), "distributed")
 
-
-def test_ranks_with_other_data_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def gathered(found: list[torch.Tensor], own: torch.Tensor) -> None:
         for rank, numbers in enumerate(found):
             numbers.copy_(own * (1.0 + (1e-6 if rank else 1e-12)))

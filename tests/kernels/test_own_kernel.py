@@ -32,17 +32,6 @@ class Skewed(Kernel):
         return torch.kron(kappa.contiguous(), A)
 
 
-def test_another_backend_than_the_dense_matrix_is_warned_about_once() -> None:
-    class Unwarned(Skewed):
-        pass
-
-    kernel = Unwarned(0.7, 0.3)
-    assert kernel.using("auto") is kernel.using("dense") is kernel
-    with pytest.warns(dc.DiffeoCalibWarning, match="Unwarned .* dense matrix; .* RadialKernel"):
-        kernel.using("fused")
-    kernel.using("tiled")  # warnings are errors
-
-
 class Plain(Kernel):
     """The package's Gaussian, defined by its matrix alone, to compare all defaults with the closed forms."""
 
@@ -167,12 +156,21 @@ def fitted(kernel: Kernel) -> FittedMap:
     return dc.fit(problem, integrator=dc.RK4(2)).model
 
 
-def test_a_kernel_that_does_not_keep_its_arguments_cannot_be_saved(tmp_path: Path) -> None:
+def test_another_backend_and_kernels_that_cannot_be_saved(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="`change` of the kernel Changed cannot be saved"):
         dc.save(fitted(Changed(lambda K, _: K)), tmp_path / "x")
     with pytest.raises(InputError, match="argument `width` is not an attribute"):
         dc.save(fitted(Forgetful(0.7)), tmp_path / "x")
     assert list(tmp_path.iterdir()) == []
+
+    class Unwarned(Skewed):
+        pass
+
+    kernel = Unwarned(0.7, 0.3)
+    assert kernel.using("auto") is kernel.using("dense") is kernel
+    with pytest.warns(dc.DiffeoCalibWarning, match="Unwarned .* dense matrix; .* RadialKernel"):
+        kernel.using("fused")
+    kernel.using("tiled")  # warnings are errors
 
 
 @pytest.fixture(scope="module")

@@ -240,7 +240,6 @@ def test_rows_and_seeds(arm: Case) -> None:
     for seed in (-1, 10**20, 1.5, "7", None, True):
         calls: Any = (
             partial(arm.test.split, 0.5),
-            partial(arm.test.folds, 3),
             partial(dc.calibrate, arm.robot, arm.train),
         )
         for call in calls:

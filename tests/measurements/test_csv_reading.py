@@ -48,11 +48,12 @@ LISTED = ["q_1", "q_2", "seen_pos_x", "seen_pos_y", "seen_pos_z"]
 SEMICOLONS, COMMAS = {"sep": ";"}, {"sep": ";", "decimal": ","}
 READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
-    "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
-    "Windows": (("Kraft, größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
-    "Windows' quotation marks": (("# Tom’s arm\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
-    "Chinese": (("# 关节(度), 坐标(毫米)\n" + PLAIN).encode("gb18030"), {}, "text in gb18030, not UTF-8"),
-    "Japanese": (("# 関節, X座標, 測定\n" + PLAIN).encode("cp932"), {}, "text in cp932, not UTF-8"),
+    "UTF-16": (PLAIN.encode("utf-16"), {}, ""),
+    "Windows": (("Kraft, größe\n" + PLAIN).encode("cp1252"), {}, "line 1 before the header skipped"),
+    "Windows' letters": (PLAIN.replace("q1", "größe").encode("cp1252"), {"names": ["größe", *NAMES[1:]]}, "in cp1252"),
+    "Windows' marks": (PLAIN.replace("q1", "Tom’s").encode("cp1252"), {"names": ["Tom’s", *NAMES[1:]]}, "in cp1252"),
+    "Chinese": (PLAIN.replace("q1", "关节").encode("gb18030"), {"names": ["关节", *NAMES[1:]]}, "in gb18030"),
+    "Japanese": (PLAIN.replace("q1", "測定").encode("cp932"), {"names": ["測定", *NAMES[1:]]}, "in cp932"),
     "a number sign before the names": ("# " + PLAIN, {}, ""),
     "as numpy.savetxt writes": ("# " + separated(" ", [NAMES, *CELLS]), {"sep": " "}, ""),
     "aligned columns": (ALIGNED, {"sep": " "}, ""),

@@ -1,4 +1,4 @@
-"""The measurements in memory: validation, known noise, hidden markers and frames, subsets, splits and folds."""
+"""The measurements in memory: validation, known noise, hidden markers and frames, subsets, splits."""
 
 import copy
 import math
@@ -56,7 +56,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"q": [[0.0, 0.0]], "points": [[1, 1e300, 3]]}, "`points` ... too large ... index [0, 1] ... 1e+300"),
     ({"q": [[0.0, 1e12]], "points": [[1, 2, 3]]}, "`q` ... cannot be measured ... index [0, 1] ... 1e+12"),
     ({"q": [[0.0, nan]], "points": [[1, 2, 3]]}, "`q` ... finite ... index [0, 1] ... nan"),
-    ({"q": [[0.0]], "points": [[1, 2, 3]] * 2}, "rows: expected 1 ... got 2"),
     ({"q": [0.0, 1.0], "points": [1, 2, 3]}, "`q` ... (N, n) ... (2,)"),
     ({"q": [[0.0]], "points": [[1, 2]]}, "`points` ... (N, P, 3) or (N, 3) ... (1, 2)"),
     ({"q": np.empty((0, 2)), "points": np.empty((0, 3))}, "`q` is empty ... (0, 2); pass at least one row"),
@@ -67,7 +66,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"points": [[[1, 2, 3], [nan, nan, 6]]] * 2 + [[[1, 2, 3]] * 2]}, "row 0, marker 1 (and 1 more): expected three"),
     ({"points": [[[1, 2, 3]] * 2, [[nan] * 3] * 2, [[nan] * 3] * 2]}, "`points`, row 1, 2: no marker was seen"),
     ({"points": [[[1, 2, 3], [nan] * 3]] * 3, "marker_names": ["a", "tool"]}, "marker tool: hidden in all 3 rows"),
-    ({"points": [[[1, 2, 3], [np.inf, 1, 1]]] * 3}, "`points` ... finite"),
     ({"points": [[1, 2, 3]] * 3, "std": 0.0}, "`std`: expected positive ... got 0"),
     ({"points": [[1, 2, 3]] * 3, "std": [1e-5, -1e-5, 1.0]}, "`std`, first at index [1] ... got -1e-05"),
     ({"points": [[1, 2, 3]] * 3, "std": [1e-5] * 2}, "`std` ... () or (3,) or (3, 1) or (3, 1, 3) ... got (2,)"),
@@ -79,8 +77,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"poses": P[:2]}, "`q` and `poses` ... expected 3 ... got 2"),
     ({"poses": P, "lever": 0}, "`lever` ... above 0 ... got 0"),
     ({"poses": P, "rotation_std": [1, 0, 1]}, "`rotation_std`, first at index [1] ... got 0"),
-    ({"poses": P, "position_std": [[1, 1]] * 3}, "`position_std` ... (3, 3) ... got (3, 2)"),
-    ({"poses": P, "joint_names": ["a", "b"]}, "`joint_names`: expected 1 ... got 2"),
     ({"poses": FRAMES.mT}, "`poses`, row 0, frame 0 ... not its transpose"),
     ({"poses": FRAMES.index_fill(0, TWO, nan)}, "`poses`, row 2: no frame was seen"),
     ({"poses": FRAMES.index_fill(1, ONE, nan), "on": ["left", "right"]}, "the frame on 'right': hidden in all 3 rows"),
@@ -261,7 +257,7 @@ def test_parts_carry_poses_and_known_noise(kind: str) -> None:
         data = Measurements(q, points, ["a", "b"], ["m", "n"], std=std)
     whole = everything(data)
     assert len(whole) == (6 if kind == "poses" else 4)
-    for part in (data[3:7], data[[5, 1]], *data.split(0.6), *data.folds(3)[1], next(iter(data)), copy.deepcopy(data)):
+    for part in (data[3:7], data[[5, 1]], *data.split(0.6), next(iter(data)), copy.deepcopy(data)):
         rows = [int((data.q == own).all(1).nonzero()[0, 0]) for own in part.q]
         for name, values in everything(part).items():
             assert_close(values, whole[name][rows], rtol=0, atol=0)
@@ -284,26 +280,17 @@ def repeated_measurements(draw: st.DrawFn) -> Measurements:
     return Measurements(q, points)
 
 
-@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(2, 4), st.integers(0, 5))
-def test_splits_and_folds_cut_no_group(data: Measurements, fraction: float, k: int, seed: int) -> None:
+@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(0, 5))
+def test_splits_cut_no_group(data: Measurements, fraction: float, seed: int) -> None:
     row, group = (data.points[:, 0, axis].int().tolist() for axis in (0, 1))
     largest = int(torch.bincount(data.groups()).max())
     train, test = data.split(fraction, seed)
     assert 0 < len(train) < len(data)
     assert abs(len(train) - round(fraction * len(data))) <= largest
-    folds = [] if len(set(group)) < k else data.folds(k, seed)
-    for one, other in ((train, test), *folds):
-        rows, others = (part.points[:, 0, 0].int().tolist() for part in (one, other))
-        assert sorted(rows + others) == row
-        assert rows == sorted(rows)
-        assert not {group[own] for own in rows} & {group[own] for own in others}
-    if not folds:
-        with pytest.raises(MeasurementError, match=f"{k} folds.*got {len(set(group))}"):
-            data.folds(k, seed)
-        return
-    assert sorted(int(own) for _, test in folds for own in test.points[:, 0, 0]) == row
-    sizes = [len(test) for _, test in folds]
-    assert max(sizes) - min(sizes) <= largest
+    rows, others = (part.points[:, 0, 0].int().tolist() for part in (train, test))
+    assert sorted(rows + others) == row
+    assert rows == sorted(rows)
+    assert not {group[own] for own in rows} & {group[own] for own in others}
 
 
 def test_splits_without_repeats_and_refusals() -> None:
@@ -312,7 +299,6 @@ def test_splits_without_repeats_and_refusals() -> None:
     assert len(first) == len(second) == 70
     assert torch.equal(first.q, again.q)
     assert not torch.equal(first.q, second.q)
-    assert [len(test) for _, test in data.folds(4)] == [25] * 4
     repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
     for data in (repeated, some(1)):
         with pytest.raises(MeasurementError, match=r"cannot split.*2 distinct configurations.*got 1"):
@@ -320,8 +306,6 @@ def test_splits_without_repeats_and_refusals() -> None:
     for fraction in (0.0, 1.0, 70, nan):
         with pytest.raises(MeasurementError, match=r"`fraction`.*between 0 and 1"):
             some(10).split(fraction)
-    with pytest.raises(MeasurementError, match=r"`k`.*at least 2"):
-        some(10).folds(1)
 
 
 @pytest.mark.parametrize("seed", range(5))

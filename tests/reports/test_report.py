@@ -1,22 +1,28 @@
-"""The HTML report: complete, self-contained, small, and true to the numbers it was made from."""
+"""The HTML report: complete, self-contained, true to its numbers; these against brute force and the simulated arm."""
 
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_bank import Command
 from kind_bank import ELSEWHERE, kind_named
 from lxml import html
 from product_bank import Case, usual_scales
+from scipy.stats import chi2
 from table_bank import refused
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.analysis.findings import Findings, find
-from diffeo_calib.reports.html.sections import figures, verdict
+from diffeo_calib.reports.analysis import predictions
+from diffeo_calib.reports.analysis.findings import Deviations, Findings, find, repeats_of, stages_of
+from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
+from diffeo_calib.reports.html.sections import advice, figures, trust, verdict
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.kinds import divided
@@ -35,7 +41,6 @@ def made(path: Path, model: dc.CalibratedKinematics, data: dc.Measurements | Non
 
 
 def check_page(text: str) -> None:
-    """Sound HTML that loads nothing."""
     page = html.fromstring(text)
     sections = [section.get("id") for section in page.iter("section")]
     assert [name for name in sections if name != "devices"] == SECTIONS  # sessions have devices
@@ -142,13 +147,11 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command)
     assert "40 rows that the model has not seen" in done.out.replace("\n", " ")
     assert "Errors against humidity" in text
     assert re.search(r"Errors against air_temp[^<]* 2 of 40 rows have no value", text)
-    alone = command("evaluate", model, "--report", out)
-    assert alone.code == 0
+    alone = command.ran("evaluate", model, "--report", out)
     assert "60 rows of the fit" in alone.out.replace("\n", " ")
 
 
 def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case) -> None:
-    """Options that do not go together, tolerances that are none, and rows of another kind; no page is written."""
     (model, table), out, old = files, tmp_path / "report.html", tmp_path / "old.csv"
     fitted = arm.train[:30].with_joint_names(arm.robot.joint_names)
     write_measurements(old, fitted, TableFormat("mm", "deg"), position=("x", "y", "z"))
@@ -161,9 +164,7 @@ def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Comm
         *((["--tolerance", text], f"--tolerance {text}") for text in ("0.5px", "0.15", "-1mm")),
     )
     for words, text in wrong:
-        done = command("evaluate", model, "--report", out, *words)
-        assert done.code == 1
-        assert text in done.err
+        assert text in command.failed("evaluate", model, "--report", out, *words)
     q, eye, two = arm.train.q, torch.eye(4, dtype=torch.float64).expand(60, 4, 4), arm.train.points.repeat(1, 2, 1)
     poses, markers = dc.Measurements.from_poses(q, eye), dc.Measurements(q, two)
     refused(
@@ -207,3 +208,174 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     assert "Spread within sockets: " in verdict(new)
     assert new.errors["calibrated"].rms == pytest.approx(dc.evaluate(kind.model, kind.new).rms)
     assert verdict(find(kind.model), 1e-3).startswith("Within")
+
+
+def of(fast: str, *slow: str) -> pytest.MarkDecorator:
+    """Cases as parameters, of which all but the first are slow."""
+    return pytest.mark.parametrize("name", [fast, *(pytest.param(name, marks=pytest.mark.slow) for name in slow)])
+
+
+@of("arm", "pair", "posed")
+def test_left_out_errors_are_those_of_a_model_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
+    """The same conditional with one row struck out, by explicit matrices."""
+    rows = FitRows(request.getfixturevalue(name).model)
+    found, covariance = rows.left_out
+    ((numbers, regression),) = rows.blocks
+    target = rows.target[numbers]
+    n, m = target.shape
+    whole = regression.factor.matrix.numpy().reshape(n, m, n, m)
+    for row in (0, 7, n - 1):
+        others = np.delete(np.arange(n), row)
+        inner = whole[others][:, :, others].reshape((n - 1) * m, -1)
+        cross = whole[row][:, others].reshape(m, -1)
+        weights = np.linalg.solve(inner, cross.T).T
+        error = target[row].numpy() - weights @ target.numpy()[others].ravel()
+        at = int(numbers[row])
+        np.testing.assert_allclose(found[at].numpy(), error, rtol=1e-5, atol=1e-11)
+        own = rows.map.noise.covariance[at].numpy()
+        expected = whole[row][:, row] - weights @ cross.T - own + rows.map.new_noise.numpy()
+        np.testing.assert_allclose(covariance[at].numpy(), expected, rtol=1e-4, atol=1e-15)
+
+
+def test_a_fit_from_the_model_alone(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its rows, their errors as the calibration found them before the fit, and what fewer rows reach."""
+    rows, blocks = FitRows(arm.model), FitRows(arm.model)
+    assert_close(rows.points, arm.train.points, atol=2e-8, rtol=0)
+    assert torch.equal(rows.measurements.q, arm.train.q)
+    errors, _ = rows.left_out
+    assert float(errors.square().sum(1).mean().sqrt()) == pytest.approx(arm.result.left_out_rms, rel=0.05)
+    curve = dict(rows.learning_curve())
+    assert list(curve) == sorted(curve)
+    assert list(curve)[-1] == len(arm.train)
+    assert list(curve.values()) == sorted(curve.values(), reverse=True)
+    fewer, scales = arm.train.rows(slice(0, 36)), arm.result.selection.scales
+    found = dc.evaluate(dc.calibrate(arm.robot, fewer, hyperparameters=scales).model, arm.test).rms
+    assert found == pytest.approx(curve[36], rel=0.35)
+    monkeypatch.setattr(predictions, "WHOLE_COORDINATES", 0)
+    monkeypatch.setattr(predictions, "BLOCK_COORDINATES", 60)
+    assert rows.whole
+    assert not blocks.whole
+    assert blocks.learning_curve()[-1][0] < len(blocks)
+    assert blocks.left_out[0].norm() > errors.norm()
+
+
+def test_forecasts_and_shares_of_a_perfect_model(arm: Case) -> None:
+    limit = 2e-5
+    curve = [(n, ((3e-3 / n) ** 2 + limit**2) ** 0.5) for n in (25, 50, 100, 200)]
+    found = forecast(curve, limit)
+    assert found is not None
+    rows, error = found
+    assert rows == 400
+    assert error == pytest.approx(((3e-3 / 400) ** 2 + limit**2) ** 0.5)
+    assert forecast([(10, 1e-3), (20, 1.1e-3), (40, 1.2e-3)], limit) is None  # no improvement
+    assert forecast(curve[:2], limit) is None  # too short
+    assert forecast(curve, 1.0) is None  # below its limit
+    seen = Predictions.of(arm.model, arm.test)
+    factor = torch.linalg.cholesky(seen.covariance)
+    draws = torch.randn(seen.away.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    perfect = seen.predicted + (factor @ draws[..., None])[..., 0]
+    exact = Predictions(seen.data, perfect, seen.predicted, seen.covariance, seen.errors)
+    np.testing.assert_allclose([exact.coverage(share) for share in SHARES.tolist()], SHARES, atol=0.07)
+    squares = exact.squares.flatten().numpy()
+    assert exact.coverage(0.8) == np.mean(squares <= chi2.ppf(0.8, 3))
+
+
+def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -> None:
+    rng = np.random.default_rng(0)
+    q = arm.test.q[[0, 0, 0, 1, 2, 2, 2, 2]]
+    points = arm.model(q).detach() + torch.from_numpy(rng.normal(scale=3e-5, size=(8, 1, 3)))
+    found = repeats_of(dc.Measurements(q, points), {"calibrated": arm.model}, 2e-5)
+    assert found is not None
+    assert found.lines.tolist() == [0, 4]
+    assert found.counts.tolist() == [3, 4]
+    squares = 0.0
+    for k, rows in enumerate(([0, 1, 2], [4, 5, 6, 7])):
+        places = points[rows, 0].numpy()
+        lengths = np.linalg.norm(places - places.mean(0), axis=1)
+        squares += (lengths**2).sum()
+        assert float(found.repeatability[k]) == pytest.approx(lengths.mean() + 3 * lengths.std(ddof=1))
+        command = arm.model(q[rows[:1]]).detach()[0, 0].numpy()
+        assert float(found.accuracy["calibrated"][k]) == pytest.approx(np.linalg.norm(places.mean(0) - command))
+    assert found.deviation == pytest.approx((squares / 5) ** 0.5)
+    steps = 4e-4 * torch.arange(12, dtype=torch.float64)[:, None]
+    neighbours = dc.Measurements(arm.test.q[:1] + steps, arm.model(arm.test.q[:1] + steps).detach())
+    for none in (arm.test, neighbours, arm.test[[0, 0, 0, 1]]):  # the last are copies
+        assert repeats_of(none, {"calibrated": arm.model}, 2e-5) is None
+
+
+@of("arm", "posed")
+def test_stages_of_a_model_are_those_of_its_fit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """`fit --report` and `evaluate --report` show the same numbers, the latter from the model file alone."""
+    case: Case = request.getfixturevalue(name)
+    dc.save(case.model, tmp_path / "model.safetensors")
+    model = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    for found, known in zip(stages_of(model).values(), case.result.stages.values(), strict=True):
+        assert dc.evaluate(found, case.test).rms == pytest.approx(dc.evaluate(known, case.test).rms, rel=1e-5)
+
+
+@of("arm", "pair", "posed")
+def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    found = Deviations.of(case.model)
+    if name == "posed":
+        variance = case.model.predict_poses(found.q, noise=False)[1][:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
+    else:
+        variance = case.model.predict(found.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
+    assert_close(found.deviation.square(), variance, rtol=1e-4, atol=0)
+    low, high = case.train.q.amin(0), case.train.q.amax(0)
+    assert bool(((found.q >= low) & (found.q <= high)).all())
+    assert found.error.measured < found.error.workspace
+    assert found.next is not None
+    assert len(found.next) == 5
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_wrong_rows_are_named_and_those_of_the_fit_left_out(arm: Case) -> None:
+    test = arm.test[:60]
+    noise = torch.randn(test.points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+    def said(size: float) -> str:
+        return " ".join(advice(find(arm.model, dc.Measurements(test.q, test.points + size * noise))))
+
+    assert "times as large" not in said(0.0)
+    assert "times as large as the model expects" in said(1.5e-4)
+    assert "not those of a calibrated robot" in said(0.01)
+    test = arm.test[:60]
+    points = test.points.clone()
+    points[17] += 0.005
+    found = find(arm.model, dc.Measurements(test.q, points))
+    assert [one.row for one in found.outliers] == [17]
+    assert trust(found).text[0].startswith("1 of 60 rows look wrong")
+    assert found.moved == []
+    turned = find(arm.model, dc.Measurements(test.q, test.points + torch.tensor([0.003, 0.0, 0.0])))
+    assert any("measuring device" in text for text in turned.moved)
+    test = arm.test[:60]
+    found, same = find(arm.model, dc.Measurements.joined([arm.train, test])), find(arm.model, arm.train)
+    assert (found.new, same.new) == (True, False)
+    assert (len(found.predictions), len(same.predictions)) == (len(test), len(arm.train))
+    assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(arm.model, test).rms)
+    shifted = dc.Measurements(test.q, test.points + torch.tensor([0.3, 0.1, -0.2]))
+    registered = arm.model.registered(shifted[:12])
+    assert len(find(registered, shifted).predictions) == len(shifted) - 12
+    assert not find(registered, shifted[:12]).new
+    refused(
+        ("calibrated model", lambda: find(arm.robot)),  # pyright: ignore[reportArgumentType]
+        (r"dc\.Measurements", lambda: find(arm.model, arm.test.q)),
+        ("warmth", lambda: find(arm.model, arm.test[:20], against=["warmth"])),
+        ("left-handed", lambda: find(arm.model, dc.Measurements(arm.test.q, arm.test.points[..., [1, 0, 2]]))),
+    )
+
+
+def test_bands_of_transmission_errors_hold_the_truth(arm: Case) -> None:
+    """Over 6 joints and 40 values each; what the bands of an arm claim errs together, so the limits are wide."""
+    rows, inside, truth = FitRows(arm.model), [], SimulatedArm(seed=1)
+    for joint, name in enumerate(arm.robot.joint_names):
+        low, high = arm.train.q[:, joint].aminmax()
+        values = torch.linspace(float(low), float(high), 40, dtype=torch.float64)
+        at = torch.zeros(40, 6, dtype=torch.float64)
+        at[:, joint] = values
+        error = arm.model.transmission(name, values) - truth.components(at).transmission[:, joint]
+        away = (error - error.mean()).abs() / rows.transmission_deviation(joint, values)
+        inside.append(float((away < 1.96).double().mean()))
+    assert 0.85 < np.mean(inside) <= 1.0, inside

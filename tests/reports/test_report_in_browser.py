@@ -115,9 +115,8 @@ def test_every_control_is_reached_by_the_keyboard(opened: Any) -> None:
     reached = set()
     for _ in range(wanted + 2):
         opened.keyboard.press("Tab")
-        reached.add(
-            opened.evaluate("[...document.querySelectorAll('a, button, [tabindex]')].indexOf(document.activeElement)")
-        )
+        controls = "[...document.querySelectorAll('a, button, [tabindex]')]"
+        reached.add(opened.evaluate(f"{controls}.indexOf(document.activeElement)"))
     assert len(reached - {-1}) == wanted
 
 

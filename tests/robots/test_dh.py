@@ -101,7 +101,6 @@ ROW = (0, 0, 0)
         ([ROW, (0, 0, 0, 0, "revolute", {"elbow": 1})], {}, "joint 'joint_2' of robot 'robot' mimics 'elbow'"),
         ([ROW, DHRow(0, 0, 0, mimic={"joint_1": nan})], {}, "the multiplier of 'joint_1' in joint 'joint_2'"),
         ([(0, nan, 0)], {}, "row 0 of the DH table: expected finite numbers"),
-        ([(0, 0, 0, 0, "ball")], {}, "the kind in row 0 of the DH table"),
         ([ROW], {"names": ["a", "b"]}, "`names`: expected 1 names"),
         (FORK, {"names": 5}, "`names`: expected 3 names, one for each row, got 5"),
         ([ROW, ROW], {"names": ["a", "a"]}, "several joints named ['a']"),
@@ -242,9 +241,7 @@ def test_cells_of_slides_limits_and_a_tip_before_the_last_row(tmp_path: Path) ->
     ("text", "message"),
     [
         ("q1,q2,x,y,z\n1,2,3,4,5\n", "is no DH table: expected a header with the columns a, alpha, d and theta"),
-        ("", "is no DH table"),
         ("a,alpha,d,theta\n", "expected rows of 4 cells, one column of each kind, got no row"),
-        ("a,alpha,d,theta\n0,1.5708,0\n", "expected rows of 4 cells"),
         ("a,alpha,d,theta,theta\n0,1.5708,0,0,0\n", "one column of each kind, got a, alpha, d, theta, theta"),
         ("a,alpha,d,theta\n0,1.5708,x,0\n", "joint 'joint_1' of .* got d 'x'"),
         ("a,alpha,d,theta,type\n0,1.5708,0,0,ball\n", "got kind 'ball'"),

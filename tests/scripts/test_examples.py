@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import simulated_camera
 from command_bank import Command
+from product_bank import usual_scales
 
-from diffeo_calib.robots.simulated_arm import SimulatedArm
+import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm, elastic_rr
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "scripts" / "examples").glob("*.py"))
@@ -33,19 +35,24 @@ def in_this_process(command: Command) -> Callable[..., subprocess.CompletedProce
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn", "given_scales")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_examples_run(
-    example: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With at most 40 simulated rows, and 14 images; scales are given where the command line fits."""
-    measure, sample, seen = SimulatedArm.measure, SimulatedArm.sample, simulated_camera.camera_arm
-    monkeypatch.setattr(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 40), seed))
-    monkeypatch.setattr(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
-    monkeypatch.setattr(subprocess, "run", in_this_process(command))
-    monkeypatch.setattr(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(example)])
+def test_examples_run(example: Path, tmp_path: Path, command: Command) -> None:
+    """With at most 40 simulated rows, 121 configurations and 14 images, and given scales."""
+    patch, measure, sample = command.monkeypatch.setattr, SimulatedArm.measure, SimulatedArm.sample
+    seen, grid, calibrate = simulated_camera.camera_arm, elastic_rr.grid, dc.calibrate
+
+    def given(robot: dc.Tree, *rows: Any, **how: Any) -> Any:
+        return calibrate(robot, *rows, **{"hyperparameters": usual_scales(robot)} | how)
+
+    patch(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 40), seed))
+    patch(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
+    patch(elastic_rr, "grid", lambda count: grid(min(count, 11)))
+    patch(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
+    patch(dc, "calibrate", given)
+    patch(subprocess, "run", in_this_process(command))
+    patch(sys, "argv", [str(example)])
+    command.monkeypatch.chdir(tmp_path)
     runpy.run_path(str(example), run_name="__main__")
-    printed = capsys.readouterr()
+    printed = command.capsys.readouterr()
     assert printed.out.count("\n") >= 3
     assert printed.err == ""
 

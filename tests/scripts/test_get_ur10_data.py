@@ -29,7 +29,6 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def failure(capsys: pytest.CaptureFixture[str], *given: object) -> str:
-    """The one sentence of a run that fails."""
     with pytest.raises(SystemExit) as stopped:
         get_ur10_data.main([str(value) for value in given])
     assert isinstance(stopped.value.code, str)  # printed on stderr with exit code 1
@@ -65,7 +64,6 @@ def test_writes_what_the_benchmark_reads(small: Path, tmp_path: Path, capsys: py
 
 
 def test_the_published_file(ur10_folder: Path, tmp_path: Path) -> None:
-    """The real table passes the check, and the robot of the descriptor is the URDF's robot."""
     get_ur10_data.main([str(tmp_path), "--from", str(ur10_folder.parent)])
     written = read(tmp_path / "ipa_ur10", json.loads((tmp_path / "ipa_ur10" / "dataset.json").read_text()))
     assert len(written.measurements) == 632

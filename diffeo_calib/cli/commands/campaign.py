@@ -197,7 +197,6 @@ class Live:
         self.journal.add(self._revised())
 
     def _append(self, row: Entry) -> int:
-        """Append a row to the table and judge it; the number of its line."""
         self.judge(self.new_lines())
         header, line = self.table.written(row)
         self._read([line], header, len(self.lines))
@@ -261,7 +260,6 @@ class Live:
         return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
 
     def _say(self, answer: Entry) -> None:
-        """Print an answer."""
         words = ["left out: " + answer["error"]] if "error" in answer else [answer["text"]] if "text" in answer else []
         if "next" in answer:
             words.append(f"  {'; '.join(filter(None, self.words))}")
@@ -342,7 +340,6 @@ def run(given: CampaignOptions) -> None:
 
 
 def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:
-    """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
         for news in chain([True], _happening(live, given, inbox)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ from diffeo_calib.cli import console, models
 from diffeo_calib.cli.declarations import DemoOptions, FitOptions, RecalibrateOptions
 from diffeo_calib.cli.main import app
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import positions_of, repeated_lines, warn_outside_range
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
@@ -64,9 +63,10 @@ def run(given: FitOptions) -> None:
         console.record.add(**({"hand_eyes": each} if len(each) > 1 else {"hand_eye": each.popitem()[1]}))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
-    console.say(*_verdict(result, judged))
+    console.say(*_verdict(result, judged), *(() if test is None else train.place_lines(test)))
     _show_errors(result, in_train, None if test is None else held_out)
-    _show_findings(result, len(train))
+    waves, outliers = (wave.sentence for wave in result.gear_lines), outlier_lines(result.outliers, len(train))
+    console.say(*waves, *outliers, result.status)
     wrong: Sequence[Outlier] = ()
     if test is not None:
         measured = positions_of(result.model, result.places(), test)
@@ -136,7 +136,6 @@ def _lines_about_places(
 
 
 def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
-    """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
     kinds = {kind: {rows: errors[kind] for rows, errors in both.items() if kind in errors} for kind in in_train}
     files = {"model": given.output, "report": given.report}
@@ -161,7 +160,6 @@ def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given
 
 
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
-    """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
     fitted = "was held out: these are errors on rows that were fitted"
     none = [f"no row {fitted}, those of new rows are larger (leave-one-out RMS: {result.left_out.rms_text})"]
     for kind, stages in in_train.items():
@@ -176,7 +174,6 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
 
 
 def _advice(judged: list[Any], *, wrong: bool, partial: bool) -> Iterator[str]:
-    """What the errors on held-out rows mean where rows are wrong, or the model no better than geometry."""
     if partial:
         yield "these errors are of all rows, also of those for which the model does not hold: see the warning"
         return
@@ -187,27 +184,6 @@ def _advice(judged: list[Any], *, wrong: bool, partial: bool) -> Iterator[str]:
             yield f"the rows that look wrong dominate the held-out RMS: repair or remove them; {median}"
         if model.rms >= geometry.rms and not (wrong and model.median < geometry.median):
             yield "the deformation does not improve on geometry for the held-out rows: measure more poses"
-
-
-def _show_findings(result: CalibrationResult, rows: int) -> None:
-    """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
-    detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
-    if detailed:
-        sizes = ((console.plain(part.name), part.displacement, part.angle) for part in result.parts)
-        cells = [
-            [name, f"{1e3 * shift:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, shift, turn in sizes
-        ]
-        title = "What explains how much (RMS over the training rows; parts may cancel)"
-        console.out.print(console.text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], cells))
-    console.say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
-    if detailed:
-        left_out, fitted = result.leave_one_out, result.fit
-        if left_out.effective is not None:
-            console.say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.count} coordinates")
-        console.say(
-            f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
-            f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
-        )
 
 
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
@@ -265,7 +241,6 @@ def run_recalibrate(given: RecalibrateOptions) -> None:
 
 
 def _found(result: Recalibration) -> Iterator[str]:
-    """Errors of the new rows, and those that hardly count."""
     moved, precision = "have moved", ""
     if result.moved is not None and result.shift is not None:
         moved = f"are {1e3 * float(result.shift.norm(dim=1).max()):.2g} mm from where they were"
@@ -310,7 +285,6 @@ def change_lines(changes: Changes, none: object = None) -> list[str]:
 
 
 def _compare(given: RecalibrateOptions) -> None:
-    """Compare a model with new measurements, or with another model."""
     model, other = models.load_kinematics(given.old), given.other
     try:
         with other.open("rb") as file:  # the header of a model is JSON after eight bytes

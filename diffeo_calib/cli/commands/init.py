@@ -34,8 +34,8 @@ from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.columns import PoseColumns
 from diffeo_calib.measurements.csv.files import read_poses
-from diffeo_calib.measurements.poses import rotation_matrices
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
+from diffeo_calib.measurements.poses import readings_of
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, ZERO
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
@@ -168,7 +168,8 @@ def _ways(
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
     length = lengths[0] or _lengths(machine.place, commanded_at)[0]
     other = lengths[1] or (_lengths(place, seen_at)[0] if place else length)
-    own, seen = _readings(commanded_turn), _readings(seen_turn)
+    each = (commanded_turn, seen_turn)
+    own, seen = ({Reading(name, unit): turns for name, unit, turns in readings_of(numbers)} for numbers in each)
     if own and seen:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
@@ -208,17 +209,6 @@ def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     return ("mm",) if largest > LARGEST_IN_METRES else ("m",) if largest < SURELY_METRES else ("m", "mm")
 
 
-def _readings(numbers: Tensor) -> dict[Reading, Tensor]:
-    """Rotations (N, 3, 3) in every convention that can be meant."""
-    rotations = dict[Reading, Tensor]()
-    count = numbers.shape[1]
-    for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == count):
-        for angle in ("deg", "rad") if count == 3 else ("rad",):
-            with suppress(InputError):
-                rotations[Reading(convention, angle)] = rotation_matrices(numbers, convention, angle=angle)
-    return rotations
-
-
 def _alike(
     commanded: tuple[Tensor, dict[Reading, Tensor]], target: tuple[Tensor, dict[Reading, Tensor]]
 ) -> list[tuple[Reading, Reading, bool]]:
@@ -226,8 +216,8 @@ def _alike(
 
     Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
     shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
-    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell. Of each body places (N, 3), m,
-    and rotations (N, 3, 3) by reading.
+    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
+    commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
     bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, target)]
@@ -256,7 +246,7 @@ def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
 
 NOT_RAISED = 1.01  # ratio of residuals without and with a joint up to which the markers do not follow it
 SIDES = {"l": "left", "r": "right"}
-FLANGES = ("flange", "tool0")  # ends of the names of links to which tools are screwed
+FLANGES = ("flange", "tool0", "ee", "eef")  # what names of links say to which tools are screwed, the surest first
 
 
 def run(given: InitOptions) -> None:
@@ -367,7 +357,6 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
 
 
 def _with_tip(robot: Path, source: proposals.Source, arm: Arm) -> proposals.Source:
-    """Drop joints at the end that no marker follows, and say why the tip is there."""
     left_out = list[str]()
     moved = (source.data.q.amax(0) - source.data.q.amin(0)).tolist()
     while len(arm.joints) > 1 and "joints" not in source.asked:
@@ -387,7 +376,9 @@ def _with_tip(robot: Path, source: proposals.Source, arm: Arm) -> proposals.Sour
         arm, source = shorter, without
     source = proposals.with_units(source) if left_out else source
     left_out += [f"no column is named after {few(arm.lacking)}"] * bool(arm.lacking)
-    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
+    tip = (arm.links.tip or [""])[0]
+    flange = f": {tip} is the flange, by its name" * any(_says(tip, word) for word in FLANGES)
+    why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers{flange}", *left_out])
     return source.into({"tip": why}, tip=arm.links.tip)
 
 
@@ -452,4 +443,9 @@ def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[
     fixed = {element.child: element.parent for path in paths for element in path if element.kind == "fixed"}
     for link in links:
         links += [child for child, parent in fixed.items() if parent == link]
-    return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])
+    named = ([link for link in links if _says(link, word)] for word in FLANGES)
+    return next((flanges[0] for flanges in named if len(flanges) == 1), links[0])
+
+
+def _says(link: str, word: str) -> bool:
+    return word in column(link).words or (len(word) > len("eef") and link.lower().endswith(word))

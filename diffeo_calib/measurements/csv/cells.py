@@ -9,7 +9,6 @@ sheets are one table if one column of both has the same texts.
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import math
 import re
@@ -24,7 +23,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
+from diffeo_calib.common.errors import MeasurementError, few, listed, shown
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(
@@ -76,7 +75,7 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
     missing = [name for name in wanted if name not in header]
     if missing:
         what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
-        fix = _near(missing, [name for name in header if name not in wanted])
+        fix = "pass the names as written in the header"
         likely = max(";,\t| ", key=header[0].count)
         if len(header) == 1 and likely in header[0]:
             got, fix = f"a single column {shown(repr(header[0]))} without {sep!r}", f"pass sep={likely!r}"
@@ -88,16 +87,6 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
         fix = "give every column its own name"
         raise MeasurementError.of(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
     return [header.index(name) for name in wanted]
-
-
-def _near(missing: Sequence[str], free: Sequence[str]) -> str:
-    """Which of the columns that no other name matches may be meant; "_", "joint" and case do not count."""
-    names = {re.sub("joint|_", "", name.lower()) or name: name for name in free if len(name) <= LONGEST_NAME}
-    hints = []
-    for name in [name for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME]:
-        near = difflib.get_close_matches(re.sub("joint|_", "", name.lower()) or name, names, n=2)
-        hints += [f"for '{shown(name)}', did you mean {' or '.join(shown(names[key]) for key in near)}"] * bool(near)
-    return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
 def numbers_in(texts: Sequence[str], decimal: str, *, whole: bool = True) -> list[float | None]:
@@ -179,7 +168,6 @@ Rows = Sequence[Sequence[object]]
 
 @lru_cache(maxsize=2)  # a spreadsheet of 5000 rows takes a second, and `init` reads its tables many times
 def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
-    """The cells of a file that is no text, and what was decided."""
     if data.startswith(OLD_SHEET):
         raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
     if data.startswith(HDF5):
@@ -251,7 +239,6 @@ def _cell(value: Any) -> str:
 
 
 def _array(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
-    """An array (N, k), or one with names."""
     array = _loaded(path, lambda: np.load(file, allow_pickle=False))
     if array.dtype.names:
         return _joined(path, {name: array[name] for name in array.dtype.names})
@@ -319,7 +306,6 @@ def names_of(name: str, shape: tuple[int, ...]) -> Iterator[str]:
 
 
 def _texts(array: np.ndarray) -> list[list[str]]:
-    """The cells of an array (N, k)."""
     array = array.astype(np.int64) if array.dtype.kind == "b" else array
     array = array.astype(np.str_) if array.dtype.kind == "S" else array
     return [[_cell(value) for value in row] for row in array.tolist()]

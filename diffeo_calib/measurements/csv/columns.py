@@ -91,7 +91,6 @@ class JointExpressions:
 
 
 def _parsed(text: str) -> tuple[dict[str, float], float]:
-    """Factor of each column, and the constant."""
     if "{" not in text or not EXPRESSION.fullmatch(text):
         return {text: 1.0}, 0.0
     factors, constant = dict[str, float](), 0.0
@@ -292,11 +291,7 @@ def _names(path: str) -> dict[str, Any]:
         raise MeasurementError.of(f"'{path}' does not run", got=f"{type(error).__name__}: {error}") from error
 
 
-PER_SI = {
-    **UNITS_PER_METRE,
-    **SPHERICAL_UNITS,
-    None: 1.0,
-}  # units per rad or m; numbers without a unit are as they are
+PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}  # units per rad or m; numbers without a unit are as they are
 POSITIONS, ROTATIONS, STD, ROTATION_STD = "positions", "rotations", "std", "rotation_std"
 """Roles of the columns of a marker or frame."""
 
@@ -360,10 +355,8 @@ class Columns:
     @classmethod
     def of(cls, table: TableFormat, sensors: Sequence[Any] = ()) -> Columns:
         """Check names and kinds of columns; ``sensors``: the columns of what was measured.
-
-        Raises:
-            MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
-                without kinds, or a column named twice.
+        MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
+            without kinds, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(table.joints, table.kinds)
         if table.joint_length is not None and not kinds_known:

@@ -107,7 +107,6 @@ def _divided(rows: FileRows) -> list[tuple[SensorColumns, FileRows]]:
 
 
 def _without_copies(path: Path, data: Rows, drop: bool) -> Rows:
-    """Drop or refuse the rows that repeat an earlier one exactly."""
     copies, at = data.copies(), data.line_numbers.tolist()
     if copies and not drop:
         pairs = few([f"{at[row]} repeats {at[earlier]}" for earlier, row in copies])

@@ -261,9 +261,7 @@ def stops(
     """Stops in two recordings, in order, and the seconds to add to the times of ``measured``, estimated by default.
 
     The first three columns of ``measured`` are places, which tell whether it moves.
-
-    Raises:
-        MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
+    MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
     """
     _check_times(joints, measured.times + (offset or 0.0), limits.offset if offset is None else 0.0)
     places = Recording(measured.times, measured.values[:, :3])
@@ -303,9 +301,7 @@ def pictured(
     """Joint values (n,), means over each stop, and the time of its image as given; and how many stops have none.
 
     ``times`` (T,), s, are those of the images, to which ``offset`` is added.
-
-    Raises:
-        MeasurementError: recordings of different times, or no stop with an image.
+    MeasurementError: recordings of different times, or no stop with an image.
     """
     _check_times(joints, times + offset, 0.0)
     rests, pictures, without = joints.still(limits.joints, limits.window), [], 0
@@ -323,7 +319,6 @@ def pictured(
 
 
 def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
-    """MeasurementError unless two recordings belong to the same time."""
     if times.max() + tolerance < joints.times[0] or times.min() - tolerance > joints.times[-1]:
         expected, fix = (
             f"{joints.times[0]:.3f} to {joints.times[-1]:.3f} s, as of the joints",

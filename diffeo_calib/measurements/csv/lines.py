@@ -56,19 +56,15 @@ OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 class CsvLines:
     """A table in a text file; blank lines are skipped.
-
-    Args:
-        path: the file, which is read once. sep: one character between cells.
-        wanted: names of columns, by which the header is known.
+    path: the file, which is read once. sep: one character between cells.
+    wanted: names of columns, by which the header is known.
 
     Attributes:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
         notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
         sha256: of the file.
-
-    Raises:
-        MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
+    MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
     """
 
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
@@ -94,9 +90,7 @@ class CsvLines:
 
     def rows(self, most: int | None = None) -> Lines:
         """The lines below the header, of the first ``most`` if given.
-
-        Raises:
-            MeasurementError: no row, or lines of different lengths.
+        MeasurementError: no row, or lines of different lengths.
         """
         below = list(islice((line for line in self._cells() if line[0] > self._last), most))
         expected, named = len(self.header), self._last > 0  # not where columns are counted
@@ -339,7 +333,6 @@ def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
 
 
 def _is_units(cells: Sequence[str]) -> bool:
-    """Whether a line holds units alone, of at least one column."""
     return all(map(unit_of, filter(None, cells))) and any(unit_of(cell) not in ("", "-", "none") for cell in cells)
 
 
@@ -355,7 +348,6 @@ def _uncommented(cells: list[str], width: int) -> list[str]:
 
 @lru_cache(maxsize=1 << 14)  # `init` reads a table in many units
 def _value(text: str) -> bool:
-    """Whether a text is a number, with any decimal mark."""
     values = (number(text, decimal) for decimal in ".,")
     return any(value is not None and not isnan(value) for value in values)
 

@@ -219,11 +219,9 @@ class PositionColumns(SensorColumns):
 @dataclass(frozen=True)
 class SocketColumns(SensorColumns):
     """How a table names sockets.
-
-    Args:
-        names: of the columns, such as place and socket; the last one names the socket at its place.
-        distances: known distances between sockets, m. distance_std: their standard deviation, m.
-        on: name of the tip that carries the ball.
+    names: of the columns, such as place and socket; the last one names the socket at its place.
+    distances: known distances between sockets, m. distance_std: their standard deviation, m.
+    on: name of the tip that carries the ball.
     """
 
     names: Sequence[str]
@@ -423,10 +421,8 @@ class ImageColumns(SensorColumns):
 
 def columns_of(table: TableFormat) -> Columns:
     """The columns of a table, by the kinds of its rows.
-
-    Raises:
-        MeasurementError: no kind of rows, options of rotations that do not match, or options for something that is not
-            measured.
+    MeasurementError: no kind of rows, options of rotations that do not match, or options for something that is not
+        measured.
     """
     sensors = [] if table.position is None else [PositionColumns(table.for_reading())]
     sensors = [*sensors, *([] if table.sockets is None else [table.sockets]), *table.readings]

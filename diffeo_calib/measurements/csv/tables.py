@@ -131,14 +131,10 @@ class FileRows(NamedTuple):
 
 def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     """All rows of a file.
-
-    Args:
-        columns: which columns it has, and their units; the text "nan" is empty.
-        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, lines without joint values are
-            left out, and columns may have the other decimal mark.
-
-    Raises:
-        MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
+    columns: which columns it has, and their units; the text "nan" is empty.
+    zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, lines without joint values are
+        left out, and columns may have the other decimal mark.
+    MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
     Warns:
         DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
@@ -167,7 +163,9 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
         if check is not None and wrong:
             bad = [(lines[row], column.name, f"{float(values[row]):g}") for row in wrong]
             raise bad_cells(path, bad, check.expected, check.fix)
-    for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
+    read = [*columns.names, *named, *(text for column in words for text in column)]
+    notes = [note for note in file.notes if not (note.startswith("text in") and "".join(read).isascii())] + notes
+    for text in ["; ".join(notes)] * bool(notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
     for body in columns.hideable:
         if bool(numbers[:, columns.places(body.values)].isnan().all()):

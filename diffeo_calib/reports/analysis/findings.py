@@ -134,9 +134,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
 
     Rows that differ so much that the robot moves by more than the noise are neighbours, not repeats. Exact copies of a
     row, which no measurement gives, count once.
-
-    Args:
-        data: the rows. stages: name -> kinematics, the best one last. noise: of one measured coordinate, m.
+    data: the rows. stages: name -> kinematics, the best one last. noise: of one measured coordinate, m.
     """
     copies = {row for _, row in data.copies()}
     data = data.rows([row for row in range(len(data)) if row not in copies])

@@ -51,11 +51,9 @@ class FitRows:
 
     Attributes:
         of_positions: whether positions, or poses, of all markers were measured in every row.
-
-    Args:
-        model: calibrated kinematics. One that was registered stands for its fit: the markers are those of the fit.
-        measured: the measurements that it was fitted to. A model with fewer control points than rows needs them: it
-            keeps no trace of its rows' errors.
+    model: calibrated kinematics. One that was registered stands for its fit: the markers are those of the fit.
+    measured: the measurements that it was fitted to. A model with fewer control points than rows needs them: it
+        keeps no trace of its rows' errors.
     """
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
@@ -277,5 +275,4 @@ class Predictions:
 
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:
-    """Errors of predicted points (N, P, 3), m."""
     return residuals(lambda _: points, place(lambda _: points, data), data).main

@@ -26,9 +26,7 @@ VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple"
 
 class Picture:
     """One panel, drawn by ``draw(axes, *what, **how)``.
-
-    Args:
-        name: distinguishes its elements from those of other panels. label: what it shows, in words.
+    name: distinguishes its elements from those of other panels. label: what it shows, in words.
     """
 
     def __init__(

@@ -217,7 +217,6 @@ def trust(findings: Findings) -> Section:
 
 
 def _residuals(findings: Findings) -> Iterator[Picture]:
-    """Errors of every kind against the row, time and temperature, and every joint."""
     robot = findings.model.robot
     for place, kind in enumerate(findings.kinds.values()):
         errors, q = kind.errors, kind.q
@@ -314,7 +313,6 @@ WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
 ENOUGH_FOR_P95 = 20  # rows from which a 95th percentile means something
 BAD_RATIO = 1.5  # ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named
-
 
 MISCALIBRATION_PROBABILITY = 0.05
 """Probability that regions of the right size hold so few errors, or so many, that they are called wrong."""

@@ -27,11 +27,9 @@ from diffeo_calib.sensors.errors import Evaluation
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INK, FAINT, GRID = "#2b2f36", "#6b7280", "#d5d9e0"
-"""Colours of text and axes, of notes, and of grids."""
+INK, FAINT, GRID = "#2b2f36", "#6b7280", "#d5d9e0"  # colours of text and axes, of notes, and of grids
 GREY, ORANGE, BLUE, GREEN, PURPLE = "#8b9099", "#d55e00", "#0072b2", "#009e73", "#a05a8c"
 PANEL = (4.4, 3.0)  # width and height of one panel in inches: a page of 390 pixels shows it at full size
-
 
 SHORTEST_STROKE = 2e-4  # length of the stroke of a dot, in units of the values' range
 
@@ -264,7 +262,6 @@ def draw_before_after(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None
 
 
 def _sizes(evaluation: Evaluation) -> np.ndarray:
-    """Known errors in the unit in which they are shown."""
     return np.maximum(evaluation.shown[1] * known(evaluation.errors).numpy(), SMALLEST_ERROR)
 
 
