@@ -7,10 +7,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate, product
+from itertools import accumulate, permutations, product
 from math import pi
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
@@ -22,11 +24,12 @@ from diffeo_calib.measurements.csv.joined import SEPARATORS, joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, LENGTHS, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
-from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, ZERO
+from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, UNITS_PER_METRE, ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
+SAME_SHARE = 1e-3  # of the largest number, by which digits of one place in two units differ
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
@@ -248,6 +251,18 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     return bodies
 
 
+def in_other_units(sheet: Sheet, bodies: Sequence[Body]) -> dict[int, str]:
+    """Numbers of the places that are others in another unit of length, with fewer digits or behind them; in words."""
+    less, columns = dict[int, str](), ([name for name in body.place if name in sheet.cells] for body in bodies)
+    each = ([numbers_in(sheet.cells[name], sheet.decimal) for name in names] for names in columns)
+    for (a, one), (b, other) in permutations(enumerate(np.array(numbers, dtype=float) for numbers in each), 2):
+        for factor in {p / q for p, q in permutations(UNITS_PER_METRE.values(), 2)} if one.shape == other.shape else ():
+            away = np.abs(one - factor * other)
+            if np.isfinite(away).any() and np.nanmax(away) < SAME_SHARE * np.nanmax(np.abs(one)):
+                less[a if (len(np.unique(one)), b) < (len(np.unique(other)), a) else b] = "places in another unit"
+    return less
+
+
 def _numbered(columns: Sequence[str]) -> list[Body]:
     """Series of three numbers that may be places; else the first columns of another file, which has no names."""
     each = (group for labels in ("123", "012") for group in whole(columns, labels) if not _goes_on(columns, group))
@@ -361,6 +376,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         there = (text for text, names in devices.items() if all("" in sheet.cells[name] for name in names))
         readings = [*corners, *there]
     bodies = bodies or ([] if sockets or readings else _numbered(others))
+    less = in_other_units(sheet, bodies)
+    left += [f"{few(bodies[k].place)}: {words}" for k, words in less.items()]
+    bodies = [body for k, body in enumerate(bodies) if k not in less]
     if not bodies and not sockets and not readings:  # one column of names that repeat, such as A1, B2
         texts = [name for name in sheet.header if name not in joints and name not in sheet.numbers]
         named = [name for name in texts if 1 < len({*sheet.cells[name]}) <= len(sheet.cells[name]) / 2]

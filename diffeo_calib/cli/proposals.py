@@ -48,6 +48,7 @@ DOUBTFUL = 0.01
 SMALLEST_PART = 0.1  # of a joint's limits that a table passes through, in the right unit
 MOST_LENGTHS = 2  # units of length, by the size of the robot, with which meanings of the joints are sought
 LARGEST_TURN_DEG = 3600.0  # joint values beyond ten turns are no degrees
+SAME_JOINTS = 1e-4  # rad or m, by which digits of joint values in two units differ
 SMALLEST_SPREAD_M = 1e-9  # of points that never move
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
@@ -262,7 +263,8 @@ def with_joint_columns(source: Source, series: Sequence[guesses.JointColumns]) -
     if len(equal) > 1:
         ways = ranked(way for names in equal for way in source.into(joints=names).in_units())
         best, second = ways[0], next(other for other in ways if other.options.joints != ways[0].options.joints)
-        if not is_clear([best, second], gates.READINGS_TOLD_APART):
+        alike = inf not in (best.left, second.left) and torch.allclose(best.data.q, second.data.q, atol=SAME_JOINTS)
+        if not alike and not is_clear([best, second], gates.READINGS_TOLD_APART):
             return source.asking("joints", {names: f"uncomment the right line: {how[names]}" for names in equal})
         source, why = source.into(joints=best.options.joints), f"; {reason(best, second)}"
     for entry in (entry for entry in series[:4] if ",".join(entry.names) != source.options.joints):
@@ -293,7 +295,8 @@ def with_measured(source: Source) -> Source:
         kept = [k for k in range(len(source.bodies)) if k not in copies]
         left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in copies.items()]
         source = replace(source, bodies=[source.bodies[k] for k in kept]).remarking(*left)
-        source = source.into(position=[body.written("") for body in source.bodies])
+        why = f"{len(kept)} marker(s), by their names"
+        source = source.into({"position": why}, position=[body.written() for body in source.bodies])
         source = source.into(tip=[tips[k] for k in kept]) if len(tips) > 1 else source
     others = source.options.socket or source.options.reading or source.options.marker
     alone = len(source.bodies) == 1 and not others
@@ -387,12 +390,14 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
 
 
 def _with_meanings(best: Source) -> Source:
-    """With the units and the `joints` with which the robot explains positions; the same if there are none.
-    best: in the best units with the columns as they are.
+    """With units and `joints` with which the robot explains positions; in the best units as they are if there are none.
+    Of several places each alone too: the robot's own may be beside the measured ones.
     """
     if best.options.socket or best.options.reading:
         return best
-    for way, data in _of_one_size(best):
+    several = len(best.bodies) > 1 and len(best.options.tip or ()) < 2
+    alone = [replace(best, bodies=[own]).into(position=[own.written()]) for own in best.bodies if several]
+    for way, data in (pair for part in (best, *alone) for pair in _of_one_size(part)):
         units = way.options.angle or "", UNITS_PER_METRE[way.options.length or ""]
         meanings, joints = likely_mistakes.conventions_of(best.robot, data, units[0]), JointExpressions.of(best.joints)
         if not meanings:
@@ -402,11 +407,11 @@ def _with_meanings(best: Source) -> Source:
             text = ",".join(meaning.of_columns(joints.matrix, joints.offset, *units).texts(joints.columns, *units))
             why = f"the nominal robot then leaves {percent(meaning.left, 2)} of what the rows vary, with the columns "
             meant[text] = f"{why}as they are {percent(best.left)}{more}"
-        explained = way.into({"length": "with these joints"})
-        if len(meanings) > 1:
-            return with_measured(explained.asking("joints", meant))
+        places = (best if len(way.bodies) < len(best.bodies) else way).options.position
+        whole = replace(way, bodies=best.bodies).into({"length": "with these joints"}, position=places)
         text = next(iter(meant))
-        return with_measured(explained.into({"joints": meant[text]}, joints=text))  # only now
+        explained = with_measured(whole.into({"joints": meant[text]}, joints=text))  # only now
+        return explained.asking("joints", meant) if len(meanings) > 1 else explained
     return best
 
 

@@ -327,10 +327,7 @@ class Regression(NamedTuple):
 
 
 def regress(
-    problem: Problem,
-    deformation: GeodesicDeformation,
-    linear: LinearSolver = "auto",
-    tolerance: float = CG_TOLERANCE,
+    problem: Problem, deformation: GeodesicDeformation, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
 ) -> Regression:
     """Linearise a problem around a deformation of it and condition it on its data, which are its control points.
 
@@ -352,10 +349,7 @@ def regress(
 
 
 def linear_optimum(
-    problem: Problem,
-    deformation: GeodesicDeformation,
-    linear: LinearSolver = "auto",
-    tolerance: float = CG_TOLERANCE,
+    problem: Problem, deformation: GeodesicDeformation, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
 ) -> tuple[Momenta, float]:
     """The momenta that minimise the energy of a problem linearised around a deformation; arguments as of `regress`.
 

@@ -23,12 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import (
-    SMALLEST_NOISE_M,
-    Identification,
-    Prior,
-    identify,
-)
+from diffeo_calib.calibration.identification.identification import SMALLEST_NOISE_M, Identification, Prior, identify
 from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

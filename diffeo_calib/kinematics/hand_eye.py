@@ -26,16 +26,17 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import own_shifts
 from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
-from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import twist_at
+from diffeo_calib.robots.se3 import nearest_rotations, twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
 IN_TIP = "in_tip"
-IN_BASE, ON_TIP = 5.0, 0.5
-"""Variance of a motion that all poses share, in base and on tip, relative to that of the field in the rows; chosen by
-38 simulated arms of 20 and 40 poses that are off by 0.3 and 1 mm: in joints and links, or by random waves."""
+COMMON = torch.tensor([[1.6, 0.8], [3.0, 9.0]], dtype=torch.float64, device="cpu")
+"""Variances of shift and turn that all poses share, at base and tip, relative to those of the slopes along three axes:
+95 % of those of 1,000 random arms, with errors of joint zeros, or of links too, and 15 to 40 poses lie within."""
+SMALLEST = 1e-24  # m^2 and rad^2, mean square of the field of a perfect machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +108,9 @@ class HandEye:
         in_base = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
         if is_cartesian(geometry.chain):
-            variances, middle = _shared_errors(model, geometry)
+            (at_base, at_tip), middle = _common_motions(model, geometry)
             of_tip, of_middle = twist_at(carried[:3, 3]), twist_at(standing[:3, 3] - middle)
-            in_tip = in_tip + ON_TIP * of_tip * variances @ of_tip.mT
-            in_base = in_base + IN_BASE * of_middle * variances @ of_middle.mT
+            in_tip, in_base = in_tip + of_tip * at_tip @ of_tip.mT, in_base + of_middle * at_base @ of_middle.mT
         there = KnownPose(carried, in_tip, tip, f"in the frame of '{tip}'", IN_TIP)
         poses = there, KnownPose(standing, in_base, base, "in the robot's base", "in_base")
         return cls(*(poses if camera_on_tool else reversed(poses)))
@@ -204,16 +204,32 @@ class SetUp(NamedTuple):
         return frame_slopes(places, points.new_zeros(3)) @ self.of_frame + own_slopes(places) @ self.of_mount
 
 
-def _shared_errors(model: CalibratedKinematics, geometry: Geometry) -> tuple[Tensor, Tensor]:
-    """Mean squares (6,) of shifts and turns by the field, m^2 and rad^2; (3,) the middle of all in the base, m."""
+def _common_motions(model: CalibratedKinematics, geometry: Geometry) -> tuple[Tensor, Tensor]:
+    """Variances (2, 6) of what all poses share at base and tip, m^2 and rad^2; (3,) the middle of all in the base, m.
+
+    The slopes of the field by the flange's place, over its distance from the base, and by its turn, are a ridge
+    regression with variances as large as the field and their spread allow.
+    """
     lever, x, R = model.bodies.pose_lever(), model.map.x, geometry.base[:3, :3]
-    rigid = geometry.points(x)
+    rigid, flange = geometry.points(x), geometry.chain.tip_poses(x).view(-1, 4, 4)
     tools, away = poses_from_marks(rigid, lever), model.map.fitted_points - rigid.flatten(1)
     shift, turn = (pose_directions(tools, lever) @ away[:, :, None])[:, :, 0].split(3, 1)
-    flange = geometry.chain.tip_poses(x).view(-1, 4, 4)[:, :3, 3]
-    shift = shift + torch.linalg.cross(turn, flange @ R.mT + geometry.base[:3, 3] - tools[:, :3, 3])
-    sizes = torch.stack([shift.square().mean(), turn.square().mean()])
-    return sizes.repeat_interleave(3), flange.mean(0)
+    shift = shift + torch.linalg.cross(turn, flange[:, :3, 3] @ R.mT + geometry.base[:3, 3] - tools[:, :3, 3])
+    errors, middle, turns = torch.cat([shift @ R, turn @ R], 1), flange[:, :3, 3].mean(0), flange[:, :3, :3]
+    places = flange[:, :3, 3] - middle
+    radius = torch.maximum(middle.norm(), places.square().sum(1).mean().sqrt())
+    rotvec = rotation_numbers(nearest_rotations(turns.mean(0)).mT @ turns, "rotvec")
+    along = torch.stack([places / radius, rotvec], 1)  # (M, 2, 3)
+    size = errors.unflatten(1, (2, 3)).square().mean((0, 2)).clamp(min=SMALLEST).sqrt().repeat_interleave(3)
+    by_base = torch.stack([twist_at(place) for place in places])
+    by_tip = torch.kron(torch.eye(2, dtype=x.dtype, device=x.device), turns)
+    motions = torch.stack([by_base, by_tip], 2) * size / size[:, None, None]  # (M, 6, 2, 6)
+    slopes = motions[:, :, :, None] * along[:, None, :, :, None]  # (M, 6, 2, 3, 6)
+    ridge = torch.cat([size.new_zeros(12), along.square().mean((0, 2)).sqrt().repeat_interleave(18)]).diag()
+    matrix = torch.cat([torch.cat([motions.flatten(2), slopes.flatten(2)], 2).flatten(0, 1), ridge])
+    target = torch.cat([(errors / size).flatten(), ridge.new_zeros(len(ridge))])
+    steep = torch.linalg.lstsq(matrix, target[:, None], driver="gelsd").solution[12:].view(2, 3, 2, 3)
+    return (COMMON.to(x) * steep.square().sum(1).mean(2)).repeat_interleave(3, 1) * size.square(), middle
 
 
 def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:

@@ -196,11 +196,7 @@ class GeodesicDeformation(Deformation):
 
 
 def _inverse(jacobians: Tensor) -> Tensor:
-    """Inverses of a flow's Jacobians (M, n, n) at a time.
-
-    Raises:
-        NumericalError: one is singular, which that of an exact flow never is.
-    """
+    """Inverses of a flow's Jacobians (M, n, n) at a time; NumericalError for a singular one: an exact flow has none."""
     inverse, info = torch.linalg.inv_ex(jacobians)
     if bool(info.any()):
         raise NumericalError.of(

@@ -33,7 +33,7 @@ NUMBERS = {
 }
 """Number of a joint -> letters of its column's name."""
 TEXTS = {
-    "name": "joint name jointname frame link axis i no",
+    "name": "joint name jointname frame link axis i no gelenk achse",
     "kind": "type kind jointtype sigma",
     "unread": "mimic x y z roll pitch yaw",
     "convention": "convention dhconvention",
@@ -52,7 +52,7 @@ USUAL = {
 """Words with other meanings: they count as the cell of a column, as all of a comment, or beside these:"""
 TOPIC = "dh|denavit|conventions?|parameters?"
 PLAIN = str.maketrans({"α": "alpha", "θ": "theta", "ϑ": "theta", "β": "beta", "π": "pi", "−": "-", "$": "", "\\": ""})
-UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
+UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|grad|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
 INDEXED = re.compile(r"(a|alpha|d|theta)[_ ]*[{(]?\s*(?:[ijkn](\s*-\s*1)?|(prev)\w*)\s*[})]?")
 VALUE = re.compile(r"(?:^|\+)(?:q|theta|th|d)_?\{?\d*\}?\*?(?=$|[+-])")
 """The joint's own value in a cell, such as q1 or theta_1*."""
@@ -86,7 +86,7 @@ class DHFile:
         if len(said) > 1:
             expected = "standard or craig (modified), in one place"
             raise RobotError.of(f"'{path}' names two conventions", expected=expected)
-        own = {_what(cell): unit[1].lower().replace("°", "deg") for cell in header if (unit := UNIT.search(cell))}
+        own = {_what(cell): re.sub("°|grad", "deg", unit[1].lower()) for cell in header if (unit := UNIT.search(cell))}
         units = _units(path, rows, own)
         names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
         names = [f"joint_{name}" if name.isdecimal() else name for name in names]

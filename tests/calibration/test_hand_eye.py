@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from commanded_bank import BOARD, CAMERA, drawn, flange
+from commanded_bank import ROWS as ROWS_OF_ARM
 from commanded_bank import seen as seen_by_camera
 from product_bank import scales_of, usual_scales
 from simulated_camera import CameraArm, camera_arm
@@ -19,7 +20,9 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.poses import inverse_poses
-from diffeo_calib.robots.se3 import transforms, twist_transform
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 ROWS, TEST_ROWS = 60, 100
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3
@@ -102,19 +105,22 @@ def test_a_board_of_another_size() -> None:
 
 @pytest.mark.parametrize("camera_on_tool", [True, False])
 def test_the_mean_error_of_an_arm_may_be_a_camera_or_a_board_elsewhere(camera_on_tool: bool) -> None:
-    """Of one that is off by more on average than its errors vary; what a perfect one sees is known well."""
-    commanded = flange()
-    machine = dc.cartesian(commanded)
-    q, few = dc.pose_inputs(machine, commanded), dict.fromkeys(("joint_noise", "transmission_amplitude"), 1e-6)
+    """Of an arm with wrong joints in a small part of its space, whose errors hardly vary; not of a perfect one."""
+    arm, posture = Geometry.nominal(SimulatedArm(1).nominal), torch.tensor([0.3, -0.9, 1.2, 0.2, 0.8, 0.1])
+    q = posture + drawn(ROWS_OF_ARM, 6, seed=1) * torch.tensor([0.15, 0.15, 0.15, 0.4, 0.4, 0.6])
+    errors = 1e-3 * drawn(6, 6, seed=51) * torch.tensor([0.3, 0.3, 0.3, 1.0, 1.0, 1.0])
+    commanded, machine = arm.poses(q), dc.cartesian(arm.poses(q))
+    few = dict.fromkeys(("joint_noise", "transmission_amplitude"), 1e-6)
     scales = scales_of(6, 6, coupled_lengthscale=0.3, coupled_amplitude=4e-4, sensor_noise=1e-4, **few)
-    mean = 1e-3 * torch.tensor([1.2, -0.8, 1.0, 0.5, 0.5, -0.5], dtype=torch.float64)
     for size in (0.0, 1.0):
-        moved = twist_transform(size * (mean + 5e-4 * (3.0 * q @ drawn(6, 6, seed=1)).sin()))
-        true = transforms(moved[:, :3, :3] @ commanded[:, :3, :3], commanded[:, :3, 3] + moved[:, :3, 3])
-        there = seen_by_camera(true, camera_on_tool=camera_on_tool)
-        data = dc.Measurements.from_poses(q, there, camera_on_tool=camera_on_tool, doubt=False)
+        theta = torch.zeros(arm.size, dtype=torch.float64)
+        theta[arm.slices["joints"]] = size * errors.flatten()
+        there = seen_by_camera(arm.absorb(theta).poses(q), camera_on_tool=camera_on_tool)
+        data = dc.Measurements.from_poses(
+            dc.pose_inputs(machine, commanded), there, camera_on_tool=camera_on_tool, doubt=False
+        )
         eye = HandEye.of(dc.calibrate(machine, data, hyperparameters=scales).model, camera_on_tool=camera_on_tool)
         for own, truth in zip((eye.camera, eye.board), (CAMERA, BOARD)[:: 2 * camera_on_tool - 1], strict=True):
             away = own.pose[:3, 3] - truth[:3, 3]
             assert float((away / own.deviations[:3]).square().mean()) < 1.5**2, (size, own.where)
-            assert size > 0.0 or float(own.deviations[:3].max()) < 5e-4
+            assert size > 0.0 or float(own.deviations[:3].max()) < 2e-3

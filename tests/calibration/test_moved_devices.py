@@ -119,6 +119,10 @@ def test_the_controllers_own_positions_are_warned_about() -> None:
     for data in (exact, rounded, dc.Measurements.from_poses(q, poses, doubt=False)):
         with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
             dc.calibrate(ARM.nominal, data, hyperparameters=scales())
+    machine = dc.cartesian(y[:, 0])  # without links, more accurate than usual arms
+    places = y + 3e-5 * torch.sin(8 * y[..., [1, 2, 0]]) + 1e-5 * normal(*y.shape, seed=3)
+    _, said = warned(dc.calibrate, machine, dc.Measurements(dc.pose_inputs(machine, y[:, 0]), places))
+    assert not [text for text in said if "no errors of the robot" in text]
 
 
 @pytest.mark.parametrize("lever", [10.0, 1e-4])

@@ -87,7 +87,7 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     assert "expected some that explain the rows far better, got left_waist_joint" in text
     right = [f"right_{name}" for name in NAMES], q
     assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
-    places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "right")]
+    places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "R")]
     both = (([f"left_{name}" for name in NAMES], q.roll(1, 0)), (places[0], points.roll(1, 0)), (places[1], points))
     assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
 
@@ -142,10 +142,20 @@ def test_wished_places_and_names_that_contradict_the_numbers(proposed: Proposed)
     names = [f"m{k}_{axis}" for k in (1, 2) for axis in "xyz"]
     written, text = proposed((SERIES, q), (names, torch.cat([nominal, points], 1)))
     assert written.get("position") == ["m2_x,m2_y,m2_z"], text
+    assert 'position = ["m2_x,m2_y,m2_z"]  # 1 marker(s), by their names' in text
     assert "m1_x, m1_y, m1_z: marker 0 follows the nominal robot to 0.00" in text
+    above = torch.cat([q[:, :2], -q[:, 1:2] - q[:, 2:3], q[:, 3:]], 1)  # the forearm, from the horizon on
+    other, text = proposed((SERIES, above), (names, torch.cat([nominal, points], 1)))
+    assert (other["position"], other["joints"].split(",")[2]) == (written["position"], "-{j2}-{j3}"), text
     written, text = proposed((SERIES, q), (names, torch.cat([points, points], 1)))
     assert written["position"] == ["m1_x,m1_y,m1_z"]
     assert "m2_x, m2_y, m2_z: marker 1 is a copy of marker 0 (counted from 0); not used" in text
+    twice = [f"{name}_{unit}" for unit in ("rad", "deg") for name in NAMES]
+    places = (["x_m", "y_m", "z_m", "x_mm", "y_mm", "z_mm"], torch.cat([(points / 1e3).round(decimals=3), points], 1))
+    written, text = proposed((twice, torch.cat([q.deg2rad(), q], 1)), places)
+    assert (written["position"], written["length"]) == (["x_mm,y_mm,z_mm"], "mm")
+    assert (written["joints"], written["angle"]) in [(",".join(twice[:6]), "rad"), (",".join(twice[6:]), "deg")]
+    assert "x_m, y_m, z_m: places in another unit; not used" in text
     _, text = proposed((SERIES, q), (["goal_x", "goal_y", "goal_z"], nominal))
     assert "got goal_x, goal_y, goal_z: wished places" in text
     q, points = rows()

@@ -66,6 +66,10 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert "1 of places.csv (3.4)" in found.sentence
     other = joined(tmp_path, ("t,a", "0.8,10", "3.4,11", "6.3,12"), ("t,x", *joints[1:]), "t")
     assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
+    dates = ("t,x", "2024-06-01T09:59:59.800,10", "2024-06-01T10:00:02.400,11", "2024-06-01T10:00:05.300,12")
+    dated = (f"2024-06-01 10:00:{t - 1:06.3f},{k}" for k, t in enumerate(times[1:], 1))
+    third = joined(tmp_path, ("t,a", "2024-06-01 09:59:59.000,0", *dated), dates, "t")
+    assert [(line, cells[1:]) for line, cells in read_cells(third, ",")[1]] == [(2, ["1", "10"]), (4, ["4", "12"])]
 
 
 CLOCKS = ((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])
@@ -100,7 +104,8 @@ def recordings(seed: int = 1) -> tuple[Recording, Recording]:
     return Recording(joints, angle(joints)), Recording(seen - OFFSET_S, noisy)
 
 
-@pytest.mark.parametrize(("offset", "rate"), [(1.37, 27), (0.0, 100)])  # 100: both on one grid of times
+# 100: both on one grid of times; clocks that begin at the same number, or anywhere
+@pytest.mark.parametrize(("offset", "rate"), [(1.37, 27), (0.0, 100), (9.13, 60), (-1.7e9, 50)])
 def test_recordings_with_clocks_of_their_own(offset: float, rate: float, tmp_path: Path) -> None:
     """One line for every stop, from its middle; columns that only count or that do not move do not matter."""
     one, two = (np.arange(first, STOPS * (STAND_S + MOVE_S), step) for first, step in ((0.0, 0.01), (0.4, 1 / rate)))

@@ -138,7 +138,7 @@ FILES = {
     "blanks, greek": lines("  ", "type θ d a α", METRES),
     "makers' units": lines(
         ";",
-        "Joint;Type;alpha [deg];a [mm];d [mm];theta [deg]",
+        "Gelenk;Type;alpha [Grad];a [mm];d [mm];theta [deg]",
         [[f"A{k}", r.kind[0].upper(), *deg(r.alpha), 1e3 * r.a, 1e3 * r.d, *deg(r.theta)] for k, r in enumerate(ROWS)],
     ).replace(".", ","),
     "units without brackets, a comment": lines(

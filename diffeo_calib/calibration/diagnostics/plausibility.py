@@ -37,6 +37,7 @@ from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_u
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.readings import KIND, Readings, SocketReadings
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.tree import Tree
@@ -218,6 +219,7 @@ def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identificati
     exact = rms < gates.EXACT_SHARE * size and data.coordinates > count * placed
     shown = registration.noise > min(gates.NOMINAL_RATIO * fit.noise, gates.NOMINAL_SHARE * size)
     enough = robot.n >= gates.NOMINAL_JOINTS and data.coordinates > count * data.nominal.geometry.size
+    enough &= not is_cartesian(robot)  # errors of a machine without links are the deformation's
     if exact or (enough and not shown):
         what = f"these rows show no errors of the robot: its description explains them to {1e3 * rms:.2g} mm RMS"
         fix = "if they were computed, use what a device measured, not the position that the controller displays; to "

@@ -97,9 +97,7 @@ def machine_of(bodies: Sequence[guesses.Body]) -> guesses.Body:
 
 
 def commanded(sheet: guesses.Sheet) -> proposals.Source:
-    """The table read as poses of a machine.
-    InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
-    """
+    """The table as poses of a machine; InputError without poses, places that were measured, or a clear way to read."""
     bodies = poses_in(sheet)
     if not bodies:
         expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
@@ -234,9 +232,7 @@ def _alike(
 
 
 def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
-    """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
-    places: (N, 3), m. R: (c, N, 3, 3), of c readings.
-    """
+    """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c readings, 2 K)."""
     motions = list[Tensor]()
     for step in STEPS:
         turns = R.mT @ R.roll(-step, 1)
@@ -249,6 +245,7 @@ def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
 
 
 NOT_RAISED = 1.01  # ratio of residuals without and with a joint up to which the markers do not follow it
+SIDES = {"l": "left", "r": "right"}
 FLANGES = ("flange", "tool0", "ee", "eef")  # what names of links say to which tools are screwed, the surest first
 
 
@@ -299,9 +296,7 @@ def _commanded(robot: Path | None, sheet: guesses.Sheet) -> proposals.Source | N
 
 
 def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
-    """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
-    InputError: none do, or several.
-    """
+    """The table as values of the joints, or in the convention, that explain the rows; InputError unless one does."""
     sources, refused = dict[tuple[str | None, ...], proposals.Source](), list[InputError]()
     for arm in (arms := _arms(robot, sheet)):
         try:
@@ -349,13 +344,14 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
 
     Fingers of a gripper are no arms: each has a joint or none of its own.
     """
-    words = {path[-1].child: {*column(path[-1].child).words} for path in paths}
+    words = {path[-1].child: {SIDES.get(word, word) for word in column(path[-1].child).words} for path in paths}
     counts = Counter(word for group in words.values() for word in group)
     uses = Counter(joint.name for path in paths for joint in path if joint.kind != "fixed")
     arms = [path[-1].child for path in paths if sum(uses[joint.name] == 1 for joint in path) > 1]
     tips = list[str]()
     for marker in markers:
-        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & {*marker.words})]
+        said = {SIDES.get(word, word) for word in marker.words}
+        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & said)]
         tips += ([leaf for leaf in words if column(leaf).plain == marker.plain.removesuffix("x")] or alike)[:1]
     return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
@@ -379,6 +375,7 @@ def _with_tip(robot: Path, source: proposals.Source, arm: Arm) -> proposals.Sour
             left_out.append(f"{words}, without it {proposals.percent(without.left)}")
         arm, source = shorter, without
     source = proposals.with_units(source) if left_out else source
+    left_out += [f"no column is named after {few(arm.lacking)}"] * bool(arm.lacking)
     tip = (arm.links.tip or [""])[0]
     flange = f": {tip} is the flange, by its name" * any(_says(tip, word) for word in FLANGES)
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers{flange}", *left_out])
@@ -419,8 +416,8 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
             guessed = sheet.joint_columns(joints[:count])
             series = bool(guessed) and guessed[0].how.startswith("numbered")
             if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
-                lacking = guesses.joints_without_column(sheet.numbers, joints) if count < len(joints) else ()
-                arm = Arm(options, joints[:count], ends, guessed[0], tuple(lacking))
+                lacking = joints[count:] if series else guesses.joints_without_column(sheet.numbers, joints)
+                arm = Arm(options, joints[:count], ends, guessed[0], tuple(lacking if count < len(joints) else ()))
                 arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
                 break
     if not arms:

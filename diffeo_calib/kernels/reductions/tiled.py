@@ -108,11 +108,7 @@ class Tiled(SumBackend):
 
 
 def _symmetric(
-    weigh: Weighing,
-    points: Points,
-    summands: list[Tensor],
-    size: int,
-    own: Callable[[Sequence[Any]], list[list[int]]],
+    weigh: Weighing, points: Points, summands: list[Tensor], size: int, own: Callable[[Sequence[Any]], list[list[int]]]
 ) -> list[Tensor]:
     """Sums over the points themselves; visits each unordered pair of tiles once.
 

@@ -196,11 +196,7 @@ def compensate(
 
 
 def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object, *, path: bool) -> Pace | None:
-    """How fast corrections may change; None for rows on their own.
-
-    Raises:
-        InputError: a rate or times without a path, wrong shapes, times that do not increase.
-    """
+    """How fast corrections may change; None for rows on their own. InputError for a rate or times without a path."""
     if not path:
         if rate is not None or time is not None:
             what = "`rate` and `time` limit how fast the corrections of a path change"
@@ -217,11 +213,7 @@ def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object,
 
 
 def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[str, Tensor]:
-    """Tip -> tool (4, 4) of each target; by default the model's own on its tip, and the other tips themselves.
-
-    Raises:
-        InputError: not one tool for every tip.
-    """
+    """Tip -> tool (4, 4) of each target; by default the model's own on its tip, and the other tips themselves."""
     tips = model.robot.tips
     if not goals.of_tips:
         return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}

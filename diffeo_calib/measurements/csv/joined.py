@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,9 +75,8 @@ class _Table(NamedTuple):
         raise AssertionError("a file without the column")
 
     def numbers(self, column: str, decimal: str) -> Array:
-        """(N,) of a column, NaN for cells that are no numbers."""
-        values = [number(cell, decimal) for cell in self.sheet.column(column)]
-        return np.array([np.nan if value is None else value for value in values])
+        """(N,) of a column, seconds for dates, NaN for other texts."""
+        return np.array([_number_or_seconds(cell, decimal) for cell in self.sheet.column(column)])
 
 
 def joined_file(
@@ -94,7 +94,11 @@ def joined_file(
     timed = all(len(clock) > 1 and np.isfinite(clock).all() for clock in times)
     if timed and all((np.diff(clock) > 0).all() and np.median(np.diff(clock)) < LIMITS.window for clock in times):
         one, other = (_motion(file, at, decimal) for file, at in zip(tables, times, strict=True))  # of two clocks
-        rests, offset = stops(one, Recording(other.times, other.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
+        begin = one.times[0] - other.times[0]
+        longest = max(float(np.ptp(clock)) for clock in times)
+        seen = Recording(other.times + begin, other.values[:, :3])  # each clock may begin anywhere
+        rests, offset = stops(one, seen, StopLimits(joints=1.0, seen=1.0, offset=longest))
+        offset += begin
         pairs = [(_nearest(times[0], stop.time), _nearest(times[1], stop.time - offset)) for stop in rests]
         how = f"at the middle of every stop, {offset:+.2f} s added to the times of {places.name}"
     elif timed and 2 * len(common) < len({*measured.keys}):
@@ -136,6 +140,16 @@ def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
     apart = {pair: float(abs(joints[pair[0]] - places[pair[1]])) for pair in nearest}
     pairs = [match for match in nearest if apart[match] < 0.5 * step and _nearest(places, joints[match[0]]) == match[1]]
     return pairs, f"by the nearest time, at most {max((apart[pair] for pair in pairs), default=0.0):.3g} apart"
+
+
+def _number_or_seconds(text: str, decimal: str) -> float:
+    """A number, or a date with a time as of ISO 8601 in seconds; NaN for other texts."""
+    value = number(text, decimal)
+    if value is None and ":" in text:
+        with suppress(ValueError):
+            date = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+            return (date if date.tzinfo else date.replace(tzinfo=timezone.utc)).timestamp()
+    return np.nan if value is None else value
 
 
 def _nearest(times: Array, time: float) -> int:
@@ -324,7 +338,7 @@ def _offset(joints: tuple[Array, Array], measured: tuple[Array, Array], largest:
         raise MeasurementError.of("the offset between the clocks", expected="several motions and stops", fix=fix)
     most = round(largest / STEP_S)
     shifts = np.arange(-most, most + 1)
-    scores = np.array([float((one * np.roll(other, shift)).sum()) for shift in shifts])
+    scores = np.fft.irfft(np.fft.rfft(one) * np.fft.rfft(other).conj(), len(grid))[shifts]  # of each shift around
     best = np.flatnonzero(scores >= scores.max() - 0.5)  # the middle of those that are as good
     return float(STEP_S * shifts[best].mean())
 
