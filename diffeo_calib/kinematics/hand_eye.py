@@ -35,7 +35,7 @@ from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS
 IN_TIP = "in_tip"
 COMMON = torch.tensor([[1.6, 0.8], [3.0, 9.0]], dtype=torch.float64, device="cpu")
 """Variances of shift and turn that all poses share, at base and tip, relative to those of the slopes along three axes:
-95 % of those of 1,000 random arms, with errors of joint zeros, or of links too, and 15 to 40 poses lie within."""
+95 % of those of 250 random arms, with errors of joint zeros, or of links too, and 15 to 40 poses lie within."""
 SMALLEST = 1e-24  # m^2 and rad^2, mean square of the field of a perfect machine
 
 
