@@ -244,7 +244,10 @@ class CalibratedKinematics:
         return self.geometry.on
 
     def __repr__(self) -> str:
-        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses)"
+        carries = "" if self.payload is None else f"; payload {self.payload:g}"
+        return (
+            f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses{carries})"
+        )
 
     def to_frame(self, q: Any) -> Any:
         """Predicted markers with the standard deviations of a new measurement, as a pandas.DataFrame in m.

@@ -148,6 +148,7 @@ def test_set_ups_are_evaluated_each_in_its_place(mixed: Path, command: Command, 
 @pytest.mark.slow
 def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> None:
     kind = kind_named("payloads")
+    assert f"; payload {kind.model.payload:g}" in repr(kind.model)
     table, options = kind.table("new")
     at = options.index("--payload")
     without, out = [*options[:at], *options[at + 2 :]], ["-o", tmp_path / "out"]

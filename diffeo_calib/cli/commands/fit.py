@@ -125,6 +125,8 @@ def _lines_about_places(
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
             yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
+    if (mass := result.model.payload) is not None:
+        yield f"the model carries a payload of {mass:g}, the median of the rows, until it is told another"
     if _of_positions(held_out):  # else they are the verdict
         yield models.stage_line(result.model, result.stages, result.expected)
     yield from models.expectation_lines(result.model, data, result.expected)
