@@ -56,9 +56,7 @@ SUFFIX = ".toml"
 COMMAND, LIVE = "fit", "campaign"
 JOINED = ("rotation-std",)  # entries that may be lists of columns although the option can be repeated
 LONGEST_FILE = 1 << 20  # bytes: a file of options is short
-IN_FILE_OF = {"record": "images", **dict.fromkeys(("demo", "recalibrate"), "fit")}
-IN_FILE_OF |= {"export": "correct", **dict.fromkeys(("predict", "plan"), "evaluate")}
-"""Command -> that whose file holds its work."""
+IN_FILE_OF = {"record": "images", "demo": "fit", "predict": "evaluate"}  # command -> that whose file holds its work
 GONE = {
     "compare": "write `recalibrate OLD OTHER` without -o",
     "report": "write `evaluate MODEL [CSV] --report PAGE`",

@@ -20,7 +20,7 @@ cv2 = pytest.importorskip("cv2")
 from rendered_board import BOARD, rendered, texture  # noqa: E402
 
 from diffeo_calib.cameras.detection import Board, misfit, other_layout  # noqa: E402
-from diffeo_calib.measurements.bags import read_folders  # noqa: E402
+from diffeo_calib.measurements.image_folders import read_folders  # noqa: E402
 
 FOUND = Board.of(BOARD)
 

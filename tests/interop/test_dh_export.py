@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.cli.commands.correct import HASH
+from diffeo_calib.cli.commands.export import HASH
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.dh import dh_table, write_dh, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm

@@ -14,10 +14,11 @@ from diffeo_calib.cli.tables import stated_numbers
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together, write_whole
-from diffeo_calib.measurements.bags import page, read_bag, read_folders, read_images
+from diffeo_calib.measurements.bags import read_bag, read_images
 from diffeo_calib.measurements.csv.cells import csv_text
 from diffeo_calib.measurements.csv.joined import PLACE, TURN, StopLimits, pictured, rows_of, stops
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.image_folders import page, read_folders
 from diffeo_calib.measurements.table_format import TableFormat, options_of
 
 
