@@ -244,7 +244,7 @@ class CalibratedKinematics:
         return self.geometry.on
 
     def __repr__(self) -> str:
-        carries = "" if self.payload is None else f"; payload {self.payload:g}"
+        carries = f"; payload {self.payload:g}" if self.nominal.load else ""
         return (
             f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, fitted to {len(self.map.x)} poses{carries})"
         )
