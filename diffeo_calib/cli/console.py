@@ -129,7 +129,9 @@ def kind_entry(errors: Evaluation, *, metres: bool = False) -> dict[str, object]
 
 def entries_by_kind(errors: Mapping[str, Any]) -> dict[str, Any]:
     """Errors of every kind of rows as ``kinds``; those of measured positions once more as ``errors``, in m.
-    errors: kind -> errors, or errors by rows and by stage.
+
+    Args:
+        errors: kind -> errors, or errors by rows and by stage.
     """
     entries: dict[str, Any] = {"kinds": _each(errors, kind_entry), "errors": {}}
     for stages in errors.values():

@@ -201,8 +201,10 @@ UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "m": ("m", 1.0), "px": ("px", 1.0)}
 
 class ErrorTable:
     """Errors in their own unit, and of orientations in degrees, in a second table, if there are any.
-    rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
-    columns: names of the leading columns. expected: RMS, m, in a column of its own.
+
+    Args:
+        rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
+        columns: names of the leading columns. expected: RMS, m, in a column of its own.
     """
 
     def __init__(

@@ -45,9 +45,11 @@ def option(
     **how: Any,
 ) -> Any:
     """A field that is an option of its name, or, if it is not ``named``, an argument.
-    text: its help, by default what :class:`TableFormat` says of its name. metavar: what its value is called.
-    default: MISSING for one that is required.
-    kind: what happens to its file. how: limits of its value, as of :func:`typer.Option`.
+
+    Args:
+        text: its help, by default what :class:`TableFormat` says of its name. metavar: what its value is called.
+        default: MISSING for one that is required.
+        kind: what happens to its file. how: limits of its value, as of :func:`typer.Option`.
     """
     how = {"help": text, "metavar": metavar, **how}
     return field(default=default, metadata={"named": named, "kind": kind, "how": how})

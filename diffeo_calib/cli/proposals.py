@@ -311,7 +311,9 @@ def with_measured(source: Source) -> Source:
 
 def with_units(source: Source) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
-    InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
+
+    Raises:
+        InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
     periodic, why, ways = source.robot.periodic, "", source.units
     if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):

@@ -61,8 +61,10 @@ def in_other_unit(ratio: float, tolerance: float) -> bool:
 
 def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
     """A sentence about values in ``unit`` whose largest is unusual; none if it is not.
-    what: of USUAL_SIZES. option: argument that names their unit.
-    kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
+
+    Args:
+        what: of USUAL_SIZES. option: argument that names their unit.
+        kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
     """
     most, least = USUAL_SIZES[what]
     small, largest = unit in ("deg", "mm"), float(values.nan_to_num(0.0).abs().max()) if values.numel() else 0.0
@@ -229,7 +231,9 @@ def seen_markers(points: Tensor) -> Tensor:
 
 def marker_places(points: object) -> Tensor:
     """A checked copy (N, P, 3) of positions (N, P, 3) or (N, 3), NaN where a marker is hidden.
-    MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
+
+    Raises:
+        MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
     """
     shapes, fix = (("N", "P", 3), ("N", 3)), "pass x, y and z of every marker, in metres"
     with of_measurements():

@@ -40,9 +40,11 @@ NUMBERED = "device_names", "row_names", "places", "socket_numbers"
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Observations(RowGroups):
     """N rows of several kinds, made by :meth:`joined`.
-    parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
-        order of their first rows.
-    index: (N_i,) int64 for each part, its row numbers here.
+
+    Args:
+        parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
+            order of their first rows.
+        index: (N_i,) int64 for each part, its row numbers here.
 
     Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload, covariates,
     device_names, places and socket_numbers hold the values of all rows. A line of a file that holds observations of

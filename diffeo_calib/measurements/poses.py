@@ -193,7 +193,9 @@ def of_frames(values: Tensor) -> Tensor:
 
 def checked_frames(poses: object) -> Tensor:
     """Check poses (N, 4, 4) or (N, T, 4, 4) and return the nearest rigid ones (N, T, 4, 4), NaN where hidden.
-    InputError: wrong shape, values that are not finite, no rigid transform, or a row without any frame.
+
+    Raises:
+        InputError: wrong shape, values that are not finite, no rigid transform, or a row without any frame.
     """
     given = real_tensor(poses, "poses").detach()
     if given.ndim != 4 or given.shape[1] < 2:
@@ -269,7 +271,9 @@ def own_blocks(matrix: Tensor, count: int) -> Tensor:
 
 def frame_tips(on: Sequence[str] | None, frames: int) -> tuple[str, ...]:
     """Names of measured frames: those of their tips, or frame1, frame2, ... where these are not known.
-    on: names of the tips of their points, in threes. frames: how many there are.
+
+    Args:
+        on: names of the tips of their points, in threes. frames: how many there are.
     """
     tips = tuple(on[::POINTS]) if on is not None else ()
     return tips if len(set(tips)) == frames else tuple(f"frame{k + 1}" for k in range(frames))

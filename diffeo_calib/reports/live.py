@@ -77,7 +77,9 @@ def served(address: str, decisions: Inbox) -> Iterator[Page]:
 
 def state_of(campaign: Campaign, words: tuple[str, str], proposal: Next | None) -> dict[str, Any]:
     """Data of the page: lengths in mm, places in m in the robot's base.
-    words: the expected error, and the next poses. proposal: these.
+
+    Args:
+        words: the expected error, and the next poses. proposal: these.
     """
     robot, count, error = campaign.robot, len(campaign), campaign.expected_error
     said = [(row.row + 1, 1e3 * row.expected_error) for row in campaign.verdicts if row.expected_error is not None]

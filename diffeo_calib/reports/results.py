@@ -17,8 +17,10 @@ SIMPLE = {bool: "boolean", int: "integer", float: "number", str: "string", NoneT
 
 def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     """The JSON schema of values of a kind, with their meaning and further keywords.
-    kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
-        texts that are allowed, or a schema.
+
+    Args:
+        kind: a simple type or a union of some, ``[kind]`` for lists, ``{str: kind}`` for values by name, a tuple of the
+            texts that are allowed, or a schema.
     """
     more |= {"description": text} if text else {}
     if isinstance(kind, dict):

@@ -355,8 +355,10 @@ class Columns:
     @classmethod
     def of(cls, table: TableFormat, sensors: Sequence[Any] = ()) -> Columns:
         """Check names and kinds of columns; ``sensors``: the columns of what was measured.
-        MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
-            without kinds, or a column named twice.
+
+        Raises:
+            MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
+                without kinds, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(table.joints, table.kinds)
         if table.joint_length is not None and not kinds_known:

@@ -56,15 +56,17 @@ OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 class CsvLines:
     """A table in a text file; blank lines are skipped.
-    path: the file, which is read once. sep: one character between cells.
-    wanted: names of columns, by which the header is known.
 
-    Attributes:
-        header: the names of the columns; by position, "1", "2", ..., where no line names them.
-        units: by name of column, of a row of units below the header.
-        notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
-        sha256: of the file.
-    MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
+    Args:
+        path: the file, which is read once. sep: one character between cells.
+        wanted: names of columns, by which the header is known.
+
+        Attributes:
+            header: the names of the columns; by position, "1", "2", ..., where no line names them.
+            units: by name of column, of a row of units below the header.
+            notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
+            sha256: of the file.
+        MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
     """
 
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
@@ -90,7 +92,9 @@ class CsvLines:
 
     def rows(self, most: int | None = None) -> Lines:
         """The lines below the header, of the first ``most`` if given.
-        MeasurementError: no row, or lines of different lengths.
+
+        Raises:
+            MeasurementError: no row, or lines of different lengths.
         """
         below = list(islice((line for line in self._cells() if line[0] > self._last), most))
         expected, named = len(self.header), self._last > 0  # not where columns are counted

@@ -219,9 +219,11 @@ class PositionColumns(SensorColumns):
 @dataclass(frozen=True)
 class SocketColumns(SensorColumns):
     """How a table names sockets.
-    names: of the columns, such as place and socket; the last one names the socket at its place.
-    distances: known distances between sockets, m. distance_std: their standard deviation, m.
-    on: name of the tip that carries the ball.
+
+    Args:
+        names: of the columns, such as place and socket; the last one names the socket at its place.
+        distances: known distances between sockets, m. distance_std: their standard deviation, m.
+        on: name of the tip that carries the ball.
     """
 
     names: Sequence[str]
@@ -421,8 +423,10 @@ class ImageColumns(SensorColumns):
 
 def columns_of(table: TableFormat) -> Columns:
     """The columns of a table, by the kinds of its rows.
-    MeasurementError: no kind of rows, options of rotations that do not match, or options for something that is not
-        measured.
+
+    Raises:
+        MeasurementError: no kind of rows, options of rotations that do not match, or options for something that is not
+            measured.
     """
     sensors = [] if table.position is None else [PositionColumns(table.for_reading())]
     sensors = [*sensors, *([] if table.sockets is None else [table.sockets]), *table.readings]

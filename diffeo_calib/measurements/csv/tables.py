@@ -131,14 +131,16 @@ class FileRows(NamedTuple):
 
 def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     """All rows of a file.
-    columns: which columns it has, and their units; the text "nan" is empty.
-    zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, lines without joint values are
-        left out, and columns may have the other decimal mark.
-    MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
-    Warns:
-        DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
-            numbers; rows that are left out because no marker was seen.
+    Args:
+        columns: which columns it has, and their units; the text "nan" is empty.
+        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, lines without joint values are
+            left out, and columns may have the other decimal mark.
+        MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
+
+        Warns:
+            DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
+                numbers; rows that are left out because no marker was seen.
     """
     texts = columns.texts
     needed = [name for name, needed in texts.items() if needed]

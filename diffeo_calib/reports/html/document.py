@@ -26,7 +26,9 @@ VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple"
 
 class Picture:
     """One panel, drawn by ``draw(axes, *what, **how)``.
-    name: distinguishes its elements from those of other panels. label: what it shows, in words.
+
+    Args:
+        name: distinguishes its elements from those of other panels. label: what it shows, in words.
     """
 
     def __init__(
