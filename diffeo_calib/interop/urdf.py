@@ -58,7 +58,7 @@ def write_urdf(
         robot: the URDF to correct, by default the one that the model was fitted with.
 
     Raises InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
-    RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
+    Raises RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
     """
     geometry = geometry_of(kinematics)
     write_whole(path, corrected_urdf(geometry, urdf_of(geometry.chain, robot)))

@@ -42,8 +42,8 @@ def read_bag(bag: Path, joints: str, view: str) -> tuple[Recording, list[str], R
     joints: topic of sensor_msgs/JointState, or TOPIC:NAME,NAME for some of its joints.
     view: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
         whose motion was measured: TOPIC:CHILD, or TOPIC:PARENT>CHILD for two frames that transforms join.
-    InputError: rosbags is missing, or the bag cannot be read.
-    MeasurementError: topics, joints or frames that it does not have, or topics that hold something else.
+    Raises InputError: rosbags is missing, or the bag cannot be read.
+    Raises MeasurementError: topics, joints or frames that it does not have, or topics that hold something else.
     """
     (joints, _, wanted), (view, _, frames) = (words.partition(":") for words in (joints, view))
     states, edges, fixed = dict[str, _Rows](), dict[_Edge, _Rows](), set[_Edge]()

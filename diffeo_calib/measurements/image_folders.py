@@ -100,8 +100,8 @@ def read_folders(
     The table's column `image`, or another one of file names of images, names the file of each row, in every folder that
     has one; without it the rows are those of the files of each folder in the order of the numbers in their names.
     ``progress`` is called as ``progress(task, done, total)``.
-    MeasurementError: rows and images that do not belong to one another, or a folder without an image that shows the
-        board; folders of the same name.
+    Raises MeasurementError: rows and images that do not belong to one another, or a folder without an image that shows
+        the board; folders of the same name.
     """
     names = [folder.resolve().name for folder in folders]
     if len(set(names)) < len(names):

@@ -140,7 +140,7 @@ def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
     These are rows with the same columns; rows of several kinds, and all with ``apart``, become :class:`Observations`.
     Beside images of a board positions and rows in sockets become readings of points of the same tool, see
     sensors/tool_frames.py.
-    MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or known deviations.
+    Raises MeasurementError: no table; tables that differ in joints, payloads, markers, tips, sockets or deviations.
     """
     pieces = _pieces(tables)
     if any("corners" in table.columns for table, _ in pieces):

@@ -42,7 +42,7 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
             SciPy's letters: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
         angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; other conventions have no unit.
         place: names a row in messages.
-    InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
+    Raises InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
         whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
     """
     count = numbers_of(convention, angle)
@@ -80,7 +80,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
 
     Where a rotation can be written in several ways, quaternions have a non-negative scalar, rotation vectors are no
     longer than pi, and Euler angles are SciPy's choice.
-    InputError: unknown convention or unit, or no rotation matrices.
+    Raises InputError: unknown convention or unit, or no rotation matrices.
     """
     count, given = numbers_of(convention, angle), real_tensor(matrices, "rotations").detach()
     if given.ndim < 3 or given.shape[-2:] != (3, 3):
@@ -116,7 +116,7 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     """The poses (N, 4, 4), m, whose three points are nearest to points (N, 3, 3), m, in the sum of squares.
 
     They are detached, except inside transforms of torch.func and while a program is recorded.
-    InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
+    Raises InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
     """
     check_lever(lever)
     if isinstance(points, Tensor) and wrapped(points):

@@ -27,7 +27,7 @@ FILES: list[Case] = [
     ('"q1",q2,x,y,z\n"1\n",2,3,4,5\n1,2\n' + "1\n" * 6, {}, "line 4, 5, 6, 7, 8 and 2 more: ... got 2"),
     ("q1,q2,x,y,z,q2\n", {}, "header: ['q2'] named more than once"),
     (HEADER, {"joints": ["Q1", "q22"]}, "no column ['Q1', 'q22'] ... ['q1', 'q2'"),
-    ("q1,joint_Q2,x,y,z\n1,2,3,4,5\n", {}, "no column ['q2'] ... joint_Q2"),
+    ("q1,joint_Q2,x,y,z\n1,2,3,4,5\n", {}, "for 'q2', did you mean joint_Q2."),
     (HEADER, {"position": ["x", "y", "height"]}, "no column ['height'] ... written in the header"),
     (GERMAN + "1;2;3;4;5\n", {}, "single column 'q1;q2;x;y;z' without ',' ... pass sep=';'"),
     (DECIMALS, {"sep": ";"}, "line 3, column 'q1' (and 2 more, on line 4) ... '1,5' ... decimal comma ... decimal=','"),

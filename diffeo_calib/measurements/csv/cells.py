@@ -9,6 +9,7 @@ sheets are one table if one column of both has the same texts.
 from __future__ import annotations
 
 import csv
+import difflib
 import io
 import math
 import re
@@ -23,7 +24,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from diffeo_calib.common.errors import MeasurementError, few, listed, shown
+from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(
@@ -75,7 +76,7 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
     missing = [name for name in wanted if name not in header]
     if missing:
         what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
-        fix = "pass the names as written in the header"
+        fix = _near(missing, [name for name in header if name not in wanted])
         likely = max(";,\t| ", key=header[0].count)
         if len(header) == 1 and likely in header[0]:
             got, fix = f"a single column {shown(repr(header[0]))} without {sep!r}", f"pass sep={likely!r}"
@@ -87,6 +88,16 @@ def find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str)
         fix = "give every column its own name"
         raise MeasurementError.of(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
     return [header.index(name) for name in wanted]
+
+
+def _near(missing: Sequence[str], free: Sequence[str]) -> str:
+    """Which of the columns that no other name matches may be meant; "_", "joint" and case do not count."""
+    names = {re.sub("joint|_", "", name.lower()) or name: name for name in free if len(name) <= LONGEST_NAME}
+    hints = []
+    for name in [name for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME]:
+        near = difflib.get_close_matches(re.sub("joint|_", "", name.lower()) or name, names, n=2)
+        hints += [f"for '{shown(name)}', did you mean {' or '.join(shown(names[key]) for key in near)}"] * bool(near)
+    return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
 def numbers_in(texts: Sequence[str], decimal: str, *, whole: bool = True) -> list[float | None]:

@@ -261,7 +261,7 @@ def stops(
     """Stops in two recordings, in order, and the seconds to add to the times of ``measured``, estimated by default.
 
     The first three columns of ``measured`` are places, which tell whether it moves.
-    MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
+    Raises MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
     """
     _check_times(joints, measured.times + (offset or 0.0), limits.offset if offset is None else 0.0)
     places = Recording(measured.times, measured.values[:, :3])
@@ -301,7 +301,7 @@ def pictured(
     """Joint values (n,), means over each stop, and the time of its image as given; and how many stops have none.
 
     ``times`` (T,), s, are those of the images, to which ``offset`` is added.
-    MeasurementError: recordings of different times, or no stop with an image.
+    Raises MeasurementError: recordings of different times, or no stop with an image.
     """
     _check_times(joints, times + offset, 0.0)
     rests, pictures, without = joints.still(limits.joints, limits.window), [], 0

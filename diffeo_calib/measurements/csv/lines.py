@@ -61,12 +61,13 @@ class CsvLines:
         path: the file, which is read once. sep: one character between cells.
         wanted: names of columns, by which the header is known.
 
-        Attributes:
-            header: the names of the columns; by position, "1", "2", ..., where no line names them.
-            units: by name of column, of a row of units below the header.
-            notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
-            sha256: of the file.
-        MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
+    Attributes:
+        header: the names of the columns; by position, "1", "2", ..., where no line names them.
+        units: by name of column, of a row of units below the header.
+        notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
+        sha256: of the file.
+
+    Raises MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
     """
 
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:

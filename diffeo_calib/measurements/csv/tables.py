@@ -138,9 +138,9 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
             left out, and columns may have the other decimal mark.
         MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
 
-        Warns:
-            DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
-                numbers; rows that are left out because no marker was seen.
+    Warns:
+        DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
+            numbers; rows that are left out because no marker was seen.
     """
     texts = columns.texts
     needed = [name for name, needed in texts.items() if needed]
