@@ -263,7 +263,8 @@ def with_joint_columns(source: Source, series: Sequence[guesses.JointColumns]) -
     if len(equal) > 1:
         ways = ranked(way for names in equal for way in source.into(joints=names).in_units())
         best, second = ways[0], next(other for other in ways if other.options.joints != ways[0].options.joints)
-        alike = inf not in (best.left, second.left) and torch.allclose(best.data.q, second.data.q, atol=SAME_JOINTS)
+        alike = best.options.angle != second.options.angle and inf not in (best.left, second.left)
+        alike = alike and torch.allclose(best.data.q, second.data.q, atol=SAME_JOINTS)
         if not alike and not is_clear([best, second], gates.READINGS_TOLD_APART):
             return source.asking("joints", {names: f"uncomment the right line: {how[names]}" for names in equal})
         source, why = source.into(joints=best.options.joints), f"; {reason(best, second)}"

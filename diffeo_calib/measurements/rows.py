@@ -336,6 +336,24 @@ class RowGroups:
                     test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
 
+    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
+        """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+
+        Where some positions were measured, they cover these: rows in sockets are in every ``train``.
+        MeasurementError for k below 2, or fewer distinct configurations than folds.
+        """
+        if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
+            raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
+        held, units, kind = self._divided
+        sizes, order = _shuffled(units, seed, kind, fewest=k, what=f"cannot make {k} folds")
+        load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
+        for group in order[np.argsort(-sizes[order], kind="stable")]:  # the largest first
+            fold_of[group] = load.argmin()
+            load[fold_of[group]] += sizes[group]
+        fold = np.full(len(self), -1)
+        fold[held] = fold_of[units.numpy()]
+        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
+
     def place_lines(self, held_out: Self) -> Iterator[str]:
         """A sentence where the sockets of one place alone are left beside rows that are held out."""
         here, there = (len({*rows.places.tolist()} - {NO_SOCKET}) for rows in (self, held_out))
@@ -390,17 +408,23 @@ def in_train(labels: Tensor, fraction: float, seed: int, kind: str) -> np.ndarra
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
         raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
-    with checks.of_measurements():
-        generator = np.random.default_rng(check_seed(seed))
-    sizes = np.bincount(labels.numpy())
-    if len(sizes) < 2:
-        got = f"{len(sizes)} (in {len(labels)} rows; repeats, and the rows of a place, stay together)"
-        what, fix = "cannot split into train and test", "measure more of them"
-        raise MeasurementError.of(what, expected=f"at least 2 {kind}", got=got, fix=fix)
+    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
     target, rows, chosen = round(fraction * len(labels)), 0, []
-    for group in generator.permutation(len(sizes)):
+    for group in order:
         after = rows + sizes[group]
         nearer = abs(after - target) < abs(rows - target)
         if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
             rows, chosen = after, [*chosen, group]
     return np.isin(labels.numpy(), chosen)
+
+
+def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
+    with checks.of_measurements():
+        checked_seed = check_seed(seed)
+    sizes = np.bincount(labels.numpy())
+    if len(sizes) < fewest:
+        got = f"{len(sizes)} (in {len(labels)} rows; repeats, and the rows of a place, stay together)"
+        fix = "measure more of them, or ask for fewer parts"
+        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
+    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))

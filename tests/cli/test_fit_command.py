@@ -9,7 +9,6 @@ import torch
 from command_bank import STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.result import parts
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
@@ -45,17 +44,10 @@ def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: 
     assert re.search(r"leave-one-out RMS: position \d+\.\d+ mm", done.out) is not None
     for stage in STAGES:
         assert len(done.numbers(stage, "20 training")) == 4
-    residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", done.out)
-    assert residuals is not None
-    assert all(float(value) <= 1e-4 for value in residuals.groups())
     loaded: Any = dc.load(model)
     assert "1 of 20 training rows look wrong (numbers are lines of the file); none was dropped:\n  row 9: " in done.out
     assert (loaded.report["rows"], loaded.report["outliers"]) == (20, 1)
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines() if "│" in line]
-    sizes = [(part.name, 1e3 * part.displacement, part.angle) for part in parts(loaded)]
-    shown = [[name, f"{size:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, size, turn in sizes]
-    assert [row for row in rows if len(row) == 3][-len(sizes) :] == shown
 
 
 @pytest.mark.usefixtures("given_scales")
