@@ -321,7 +321,7 @@ def _(bench: Bench) -> None:
     kind_bank.share_places(kind, "recalibrate", bench.command.monkeypatch)
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
-    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.compare", lambda *_, **__: found)
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.compare", lambda *_, **__: found)
     table, options = kind.table("moved")
     bench.judged("recalibrate", kind.file, table, *options)
 
@@ -347,7 +347,7 @@ def _(bench: Bench) -> None:
     kept = {(own.kind, name) for own in found.model.placement for name in own.names}
     assert {(own.kind, name) for own in kind.model.placement for name in own.names} <= kept
     assert all(bool(own.mean.isfinite().all()) for own in found.model.predict_readings(kind.q(3)))
-    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.recalibrate", lambda *_, **__: found)
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.recalibrate", lambda *_, **__: found)
     table, options = kind.table("moved")
     bench.judged("recalibrate", kind.file, table, *options, "-o", bench.folder / "again.safetensors")
 

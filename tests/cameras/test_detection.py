@@ -190,7 +190,7 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
 
 
 def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("diffeo_calib.measurements.bags._seen", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("diffeo_calib.measurements.image_folders._seen", Mock(side_effect=KeyboardInterrupt))
     for name in ("corners.csv", "corners.yaml"):
         (folder / name).write_text("old")
     before = {path: path.read_bytes() for path in folder.iterdir()}
