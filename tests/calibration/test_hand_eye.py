@@ -112,6 +112,7 @@ def test_the_mean_error_of_an_arm_may_be_a_camera_or_a_board_elsewhere(camera_on
     commanded, machine = arm.poses(q), dc.cartesian(arm.poses(q))
     few = dict.fromkeys(("joint_noise", "transmission_amplitude"), 1e-6)
     scales = scales_of(6, 6, coupled_lengthscale=0.3, coupled_amplitude=4e-4, sensor_noise=1e-4, **few)
+    deviations = list[torch.Tensor]()
     for size in (0.0, 1.0):
         theta = torch.zeros(arm.size, dtype=torch.float64)
         theta[arm.slices["joints"]] = size * errors.flatten()
@@ -124,3 +125,6 @@ def test_the_mean_error_of_an_arm_may_be_a_camera_or_a_board_elsewhere(camera_on
             away = own.pose[:3, 3] - truth[:3, 3]
             assert float((away / own.deviations[:3]).square().mean()) < 1.5**2, (size, own.where)
             assert size > 0.0 or float(own.deviations[:3].max()) < 2e-3
+        deviations.append(torch.stack([eye.camera.deviations, eye.board.deviations]))
+    perfect, wrong = (each[:, :3].norm(dim=1) for each in deviations)
+    assert bool((wrong > 1.05 * perfect).all()), "on the tip and in the base"

@@ -70,6 +70,7 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     dated = (f"2024-06-01 10:00:{t - 1:06.3f},{k}" for k, t in enumerate(times[1:], 1))
     third = joined(tmp_path, ("t,a", "2024-06-01 09:59:59.000,0", *dated), dates, "t")
     assert [(line, cells[1:]) for line, cells in read_cells(third, ",")[1]] == [(2, ["1", "10"]), (4, ["4", "12"])]
+    assert "at most 0.3 apart" in third.sentence, "seconds"
 
 
 CLOCKS = ((50.0, 53.1, 61.0), [2, 3, 4]), ((0.1, 7.0, 11.2), [2, 4]), ((50.0, 54.0, 61.0), [])
