@@ -94,13 +94,7 @@ class NewSetUp:
         same: bool = True,
         marker: str = "",
     ) -> NewRows:
-        """The rows around places, which are those where everything was before, all weights 1.
-
-        Args:
-            places: T (4, 4) from the frame of the map to that of the rows, and markers (P, 3) in the frames of their
-                tips, m. usual: noise of rows that tell coordinates.
-            deviations, marker: see :class:`NewRows`. same: whether these are the markers of the map.
-        """
+        """The rows, weights 1, around T (4, 4) from the map's frame to theirs and markers (P, 3) on their tips, m."""
         (T, markers), q = places, self.data.q
         marks = FlangePoints(robot_map(self.fitted).under(self.data.payload), markers, same=same)
         points, at = self.fitted.geodesic.with_nominal(marks).linearised_value(q)
@@ -426,22 +420,22 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
     """
     bodies, given = new.bodies, new.covariance
-    own = usual.block.new_zeros(len(new), *usual.block.shape) if given is None else turned(given, T[:3, :3].mT)
+    total = usual.block.new_zeros(len(new), *usual.block.shape) if given is None else turned(given, T[:3, :3].mT)
     alike = usual.factor > 0.0 and fitted.slopes is None and bool(fitted.noise.visible.all())
     now, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if alike else None
     if now is None or old is None:
-        mean = mean_block(own, new.visible.repeat_interleave(3, 1))
-        return own + larger(mean, usual.block) - mean
+        mean = mean_block(total, new.visible.repeat_interleave(3, 1))
+        return total + larger(mean, usual.block) - mean
     blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
     to_modes = torch.linalg.pinv(old)
     sizes, stated = (
         (to @ each @ to.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
-        for to, each in ((to_modes, blocks), (torch.linalg.pinv(now), own_blocks(own, now.shape[1])))
+        for to, each in ((to_modes, blocks), (torch.linalg.pinv(now), own_blocks(total, now.shape[1])))
     )
     rest = (blocks - old @ to_modes @ blocks).diagonal(dim1=2, dim2=3).sum(2).median(0).values
     each = (now * (usual.factor * sizes - stated).clamp(min=0.0)[:, None]) @ now.mT
     each.diagonal(dim1=2, dim2=3).add_(usual.factor * rest[:, None] / (old.shape[2] - old.shape[3]))
-    return own + block_diagonal(each)
+    return total + block_diagonal(each)
 
 
 def larger(first: Tensor, second: Tensor) -> Tensor:
