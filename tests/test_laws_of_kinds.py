@@ -46,7 +46,12 @@ LAWS: dict[str, Law] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_errors_do_not_change(kind: str) -> None:
+    """Predictions come back from a file bit by bit, those without torch nearly so."""
     own = kind_named(kind)
+    again, q = dc.load(own.file), own.q(20)
+    for ours, theirs in zip(again.predict(q), own.model.predict(q), strict=True):
+        assert_close(ours, theirs, rtol=0, atol=0)
+    assert_close(torch.from_numpy(dc.interop.load_numpy(own.file)(q.numpy())), again(q), rtol=0, atol=1e-11)
     rows = own.new.with_line_numbers(torch.arange(len(own.new)) + 100)
     expected = lines(own.model, rows)
     for law, changed in LAWS.items():
@@ -55,20 +60,6 @@ def test_the_errors_do_not_change(kind: str) -> None:
         for key, (name, errors) in expected.items():
             assert found[key][0] == name, law
             assert_close(found[key][1], errors, rtol=0, atol=1e-9, equal_nan=True, msg=law)
-
-
-SAVED = ("several tips", "sessions", "markers mounted anew", "ball in sockets", "mixture", "distances")
-"""Kinds whose models have more than joints and markers."""
-
-
-@pytest.mark.parametrize("kind", SAVED)
-def test_a_model_is_saved_whole(kind: str) -> None:
-    """Its predictions come back bit by bit, those without torch nearly so."""
-    own = kind_named(kind)
-    again, q = dc.load(own.file), own.q(20)
-    for ours, theirs in zip(again.predict(q), own.model.predict(q), strict=True):
-        assert_close(ours, theirs, rtol=0, atol=0)
-    assert_close(torch.from_numpy(dc.interop.load_numpy(own.file)(q.numpy())), again(q), rtol=0, atol=1e-11)
 
 
 def test_a_fit_in_another_frame_is_the_fit_moved() -> None:

@@ -136,11 +136,15 @@ def _remounted() -> Source:
     return of_arm(arm, remounted(arm, tracked(arm, 96, 2)), 0.2)
 
 
+def laden(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    """Under payloads that change from row to row."""
+    masses = torch.from_numpy(np.random.default_rng(0).choice([0.0, 4.0, 10.0], rows))
+    return dc.Measurements(*arm.measure(rows, seed=seed, payload=masses)).with_payload(masses)
+
+
 def _payloads() -> Source:
     arm = SimulatedArm(seed=1)
-    masses = torch.from_numpy(np.random.default_rng(0).choice([0.0, 4.0, 10.0], 56))
-    q, points = arm.measure(56, seed=1, payload=masses)
-    return of_arm(arm, dc.Measurements(q, points).with_payload(masses), 0.25, mass=4.0, payload=1.5)
+    return of_arm(arm, laden(arm, 56, 1), 0.25, mass=4.0, payload=1.5)
 
 
 def _sockets() -> Source:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from product_bank import simulated_poses, sliding_measurements, sliding_robot
+from product_bank import erring, simulated_poses, sliding_robot
 from table_bank import read_table
 from torch import Tensor
 
@@ -174,7 +174,7 @@ def test_what_joint_values_and_units_mean(words: str) -> None:
 def test_joints_of_a_slide() -> None:
     """Honest measurements have no mistake."""
     robot = sliding_robot()
-    data = sliding_measurements(robot, 40)
+    data = erring(robot, 40)
     assert advice(robot, data) == ""
     read = dc.Measurements(with_joint(data.q, 2, 1e-3), data.points)
     assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
