@@ -230,15 +230,11 @@ def _seen_from(rows: Any, T: Tensor) -> Any:
         return rows
     if rows.corners is not None:
         return rows  # the board stays
-    if rows.poses is None:
-        points = rows.points @ T[:3, :3].mT + T[:3, 3]
-        return with_attributes(rows, points=points)
-    frames = rows.frames if rows.frames.shape[1] > 1 else rows.frames[:, 0]
-    on = None if rows.on is None else rows.on[::3]
-    known: dict[str, Any] = {"camera_on_tool": rows.board is not None, "on": on, "lever": rows.lever}
-    seen = torch.linalg.inv(frames) @ T if rows.board is not None else T @ frames
-    found = dc.Measurements.from_poses(rows.q, seen, rows.joint_names, **known)
-    return found if rows.payload is None else found.with_payload(rows.payload)
+    if rows.board is not None:
+        boards = torch.linalg.inv(rows.frames[:, 0]) @ T
+        return dc.Measurements.from_poses(rows.q, boards, rows.joint_names, camera_on_tool=True, lever=rows.lever)
+    moved = rows.in_frames(T.expand(len(rows), 4, 4))
+    return with_attributes(rows, points=moved.points) if rows.poses is None else moved
 
 
 def of_payload(kind: Kind) -> dc.CalibratedKinematics:

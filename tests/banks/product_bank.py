@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import robot_data
 import torch
 from numbers_bank import drawn, inside, normal, tensor
 from torch import Tensor
@@ -15,8 +16,6 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 TEST_ROWS = 300
-BASE, TIP = "base_link", "flange"
-POSITION = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -131,10 +130,8 @@ def calibrated_poses(rows: int) -> Case:
 
 def ur10_measurements(folder: Path) -> tuple[dc.Chain, dc.Measurements]:
     """The UR10 and its 632 rows."""
-    robot = dc.load_urdf(folder / "ur10_robot.urdf", base="base_link", tip="ee_link")
-    columns = [f"measurement_{axis}" for axis in POSITION]
-    csv = folder / "measurements_iso_cubes.csv"
-    return robot, dc.read_measurements(csv, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
+    found = robot_data.read(folder, robot_data.BUILT_IN["ipa_ur10"])
+    return found.robot, found.measurements
 
 
 def sliding_robot() -> dc.Chain:

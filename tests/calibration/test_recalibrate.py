@@ -223,7 +223,7 @@ def test_a_worn_joint_is_named_and_followed(arm: Case) -> None:
 @pytest.mark.parametrize("name", ["payloads", "heights"])
 def test_a_worn_joint_is_found_by_rows_of_other_kinds(name: str) -> None:
     """60 rows in sockets leave 0.5 mm, and distances show a change of no joint."""
-    worn = SimulatedArm(seed=name == "payloads").worn(WORN, FACTOR)
+    worn = SimulatedArm(seed=int(name == "payloads")).worn(WORN, FACTOR)
     found: Any = dc.compare(model(name), laden(worn, NEW, 5) if name == "payloads" else of_ball("height", worn, NEW))
     (change,) = found.changes.found
     assert change.part == JOINTS[WORN]
@@ -434,9 +434,6 @@ def test_what_is_refused(tmp_path: Path) -> None:
     def again(rows: Any = new, model: Any = None, **options: Any) -> Callable[[], object]:
         return lambda: dc.recalibrate(model or old(), rows, **options)
 
-    def of_size(factor: float) -> dc.Measurements:
-        return dc.Measurements(new.q, factor * new.points, doubt=False)
-
     refused(
         ("fitted to 60 of these 60 measurements: they would count twice; pass rows", again(first)),
         ("fitted to 30 of these 30 measurements: they would count twice; pass rows", again(model=learnt)),
@@ -449,9 +446,10 @@ def test_what_is_refused(tmp_path: Path) -> None:
         (r"expected 1 marker\(s\), got 2 marker.*register", again(simulated(9, markers=2)[1])),
         (r"expected 1 marker\(s\), got poses.*register", again(simulated_poses(9)[1])),
         ("the new rows: expected poses", again(ball.with_joint_names(posed.robot.joint_names), posed.model)),
-        (r"no place of device and markers explains these rows.*`length`", again(of_size(1e3))),
-        (r"no place of device and markers explains these rows.*`length`", again(of_size(1e-3))),
-        (r"do not tell where the measuring device stands.*several joints", again(still)),
+        (
+            r"no place of device and markers explains these rows.*`length`",
+            again(dc.Measurements(new.q, 1e3 * new.points, doubt=False)),
+        ),
         (r"do not tell where the measuring device stands.*several joints", lambda: dc.compare(old(), still)),
         ("models of one robot", lambda: dc.compare(old(), made("slides"))),
     )
