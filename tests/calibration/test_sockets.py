@@ -19,12 +19,7 @@ from tangent_bank import covariance
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
-from diffeo_calib.calibration.identification.identification import (
-    KindRows,
-    Rows,
-    estimated,
-    held_parameters,
-)
+from diffeo_calib.calibration.identification.identification import KindRows, Rows, estimated, held_parameters
 from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places

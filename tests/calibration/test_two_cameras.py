@@ -21,7 +21,6 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.files import camera_text, read_camera
-from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
@@ -88,15 +87,6 @@ def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> 
     assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
     alone = own.moved.rows([name == "right" for name in own.moved.camera_names])
     check_hand_eyes(dc.recalibrate(own.model, alone).model, 1e-4)
-
-
-def test_the_size_of_the_board_is_known_once() -> None:
-    scale = UNKNOWNS.index("scale")
-    known = [float(camera.deviations[scale]) for camera in data().cameras.values()]
-    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.02)  # images alone show no size
-    again = of_corners(camera=data().cameras)
-    known = [float(camera.deviations[scale]) for camera in again.cameras.values()]
-    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.03)
 
 
 def test_the_files_of_each_camera_begin_with_its_name(tmp_path: Path) -> None:
