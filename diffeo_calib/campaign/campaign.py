@@ -228,11 +228,13 @@ class Campaign:
         q = torch.cat([self.table.q[again], proposal.q])[:count]
         return replace(proposal, q=q, rows=proposal.rows[: count - len(again)], again=again)
 
-    def wait(self) -> None:
-        """Wait for models that are made in the background: with one that is there the next may be due."""
+    def wait(self) -> bool:
+        """Wait for models that are made in the background, also the next that is due; whether there was one."""
+        made = False
         while self._maker is not None:
             self._maker.join()
-            self.poll()
+            made |= self.poll()
+        return made
 
     def _add(self, whole: Any, waiting: int) -> None:
         """Judge some rows of a table, and renew the model if it is due."""

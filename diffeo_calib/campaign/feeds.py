@@ -26,7 +26,7 @@ is answered and not taken in again. Other numbers under an id that the table has
 
 Other objects: `{}` asks for the last seven of these alone; `{"do": "reject", "line": 5}` leaves a row out, "accept"
 takes it in, "repeat" leaves it out and puts its pose first among the next. The last line, when the campaign ends, says
-`"ended": true`.
+`"ended": true`, with what is `revised` since the last answer.
 """
 
 from __future__ import annotations

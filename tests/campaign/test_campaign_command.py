@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,7 @@ from command_bank import PROGRAM, Command, Outcome
 from table_bank import refused
 
 import diffeo_calib as dc
+from diffeo_calib.campaign.campaign import Campaign
 from diffeo_calib.campaign.feeds import LONGEST_LINE, Inbox, as_line, check_cells, parsed, read_lines
 from diffeo_calib.campaign.journal import GrowingTable, Journal
 from diffeo_calib.common.errors import InputError
@@ -310,6 +312,30 @@ def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[...,
     assert (tmp_path / "accepted.csv").read_text().splitlines() == table[:2] + table[3:]
     _, (_, again, _) = run([row(6)])
     assert (again["line"], again["accepted_rows"]) == (7, 5)
+
+
+def test_what_the_last_model_changes_is_answered(
+    tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model that is there only after the last row: what is accepted is the last that was said of each line."""
+    ended, make = Event(), Campaign._make
+    monkeypatch.setattr(Campaign, "_make", lambda *given: ended.wait() and make(*given))
+
+    def lines() -> Iterator[bytes]:
+        yield from (row(number, **({"x": 0.0} if number == 14 else {})) for number in range(16))
+        ended.set()
+
+    _, answers = run(lines())
+    accepted = {one["line"]: one["accepted"] for one in answers if "line" in one}
+    assert all(accepted.values())
+    accepted |= {one["line"]: one["accepted"] for answer in answers for one in answer["revised"]}
+    assert not accepted[16]
+    table, kept = ((tmp_path / name).read_text().splitlines() for name in ("run.csv", "accepted.csv"))
+    assert kept[1:] == [table[number - 1] for number in sorted(accepted) if accepted[number]]
+    entries = (json.loads(line) for line in (tmp_path / "run.csv.journal").read_text().splitlines())
+    assert {"row": 14, "accepted": False}.items() <= {
+        k: v for one in entries if "row" in one for k, v in one.items()
+    }.items()
 
 
 def test_pages_of_nothing_and_of_a_row(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:

@@ -143,14 +143,22 @@ class Live:
 
     def poll(self) -> bool:
         """Say what a model that was made in the background changes; whether there was one."""
-        if not self.campaign.poll():
-            return False
+        made = self.campaign.poll()
+        if made:
+            self._changed()
+        return made
+
+    def end(self) -> None:
+        """Wait for models that are made in the background, and say what they change."""
+        if self.campaign.wait():
+            self._changed()
+
+    def _changed(self) -> None:
         self.journal.add(self._revised())
         self.late += self.revised
         if not self.given.stdin:  # those who send rows get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
-        return True
 
     def take(self, entry: Entry | DiffeoCalibError) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
@@ -255,9 +263,13 @@ class Live:
         if number in self.unreadable:
             return answer | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
         of_line = [verdict for verdict in every if verdict.line == number + 2]
-        answer = of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line))}
-        revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
-        return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
+        return of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line)), "revised": self.told()}
+
+    def told(self) -> list[Entry]:
+        """Rows that changed since this was asked last."""
+        every, rows = self.campaign.verdicts, dict.fromkeys([*self.late, *self.revised])
+        self.late, self.revised = [], []
+        return [{"line": every[row].line, "accepted": every[row].accepted} for row in rows]
 
     def _say(self, answer: Entry) -> None:
         words = ["left out: " + answer["error"]] if "error" in answer else [answer["text"]] if "text" in answer else []
@@ -350,7 +362,7 @@ def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | Non
                 break
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    live.campaign.wait()
+    live.end()
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
@@ -378,7 +390,7 @@ def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[boo
 
 
 def _end(live: Live) -> None:
-    state = live.state() | {"ended": True}
+    state = live.state() | {"revised": live.told(), "ended": True}
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
     later = len(live.new_lines())
