@@ -127,7 +127,9 @@ def test_tables_of_several_cameras_that_cannot_be() -> None:
 
 
 def test_every_camera_and_session_warns_of_a_board_of_another_size() -> None:
-    rows = of_corners(corners=data().corners * tensor([1.04] * 3 + [1.0] * 2)).with_sessions(["day 1", "day 2"] * 30)
+    rows = of_corners(corners=data().corners * tensor([1.04] * 3 + [1.0] * 2)).with_sessions(
+        ["day 1"] * 30 + ["day 2"] * 30
+    )
     with pytest.warns(dc.DiffeoCalibWarning, match=r"size of the board.*[34].\d % larger"):
         place(kind().robot, rows, silent)
 
