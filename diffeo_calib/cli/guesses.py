@@ -205,7 +205,7 @@ def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tupl
     labels += [("numbered in the order of the URDF's joints", digits) for digits in series]
     named = [(naming, how, group) for how, naming in labels for group in groups(columns, naming)]
     mixed = Group((), (), _mixed(columns, full, bare))
-    return iter([(bare, usual, mixed)] * bool(mixed.names) + named)
+    return iter([(full, usual, mixed)] * bool(mixed.names) + named)
 
 
 def _mixed(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> dict[str, str]:
@@ -217,7 +217,7 @@ def _mixed(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> 
         texts = whole_name, label, *(f"{sign}{k + 1}" for sign in DH_SIGNS)
         short = (text for text, labels in starts.items() if labels == [label])
         if text := next((text for text in texts if text in there), next(short, "")):
-            names[label] = there[text]
+            names[whole_name] = there[text]
     return names if len({*names.values()}) == len(full) else {}
 
 
