@@ -233,17 +233,8 @@ ATTRIBUTES |= {"without_device", "ball", "workspace"}
 THROUGH = {"len", "bool", "int", "float"}
 
 
-def branches(root: Path) -> dict[str, list[int]]:
-    found = {}
-    for path in (path for room in ROOMS for path in sorted((root / room).rglob("*.py"))):
-        name = path.relative_to(root).as_posix()
-        lines = [] if name in OF_DEVICES else lines_of(path.read_text(encoding="utf-8"))
-        found |= {name: lines} if lines else {}
-    return found
-
-
 def lines_of(source: str) -> list[int]:
-    return sorted(test.lineno for test in _tests(ast.parse(source)) if any(map(_asks, _deciding(test))))
+    return sorted(test.lineno for test in _tests(ast.parse(source)) if _asks(test))
 
 
 def _tests(tree: ast.AST) -> Iterator[ast.expr]:
@@ -253,50 +244,34 @@ def _tests(tree: ast.AST) -> Iterator[ast.expr]:
         elif isinstance(node, ast.comprehension):
             yield from node.ifs
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
-            yield from (side for side in (node.left, node.right) if _is_truth(side))
+            truths = (side for side in (node.left, node.right) if isinstance(side, (ast.Compare, ast.BoolOp, ast.Call)))
+            yield from (side for side in truths if not isinstance(side, ast.Call) or ast.unparse(side.func) == "bool")
 
 
-def _is_truth(node: ast.expr) -> bool:
-    called = isinstance(node, ast.Call) and ast.unparse(node.func) == "bool"
-    return called or isinstance(node, (ast.Compare, ast.BoolOp))
-
-
-def _deciding(node: ast.expr) -> Iterator[ast.expr]:
-    """The values that decide a test, and the comparisons on the way to them."""
-    inner: list[ast.expr] = []
-    if isinstance(node, ast.BoolOp):
-        inner = node.values
-    elif isinstance(node, ast.UnaryOp):
-        inner = [node.operand]
-    elif isinstance(node, ast.Compare):
-        yield node
-        inner = [node.left, *node.comparators]
-    elif isinstance(node, ast.Subscript):
+def _asks(node: ast.AST) -> bool:
+    """Whether a value that decides a test is one of those."""
+    inner = list(ast.iter_child_nodes(node))
+    if isinstance(node, (ast.Attribute, ast.Name)):
+        return node.attr in ATTRIBUTES if isinstance(node, ast.Attribute) else node.id in NAMES
+    if isinstance(node, ast.Constant):
+        return str(node.value) in KINDS
+    if isinstance(node, ast.Subscript):
         inner = [node.value]
-    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("any", "all"):
-        inner = [node.func.value]
-    elif isinstance(node, ast.Call) and ast.unparse(node.func) in THROUGH:
-        inner = node.args
-    else:
-        yield node
-    for one in inner:
-        yield from _deciding(one)
-
-
-def _asks(node: ast.expr) -> bool:
-    if isinstance(node, ast.Call):
-        named = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
-        return ast.unparse(node.func) == "isinstance" and bool(named & TABLES)
-    if isinstance(node, ast.Compare):
-        constants = [one for side in (node.left, *node.comparators) for one in ast.walk(side)]
-        return any(isinstance(one, ast.Constant) and str(one.value) in KINDS for one in constants)
-    if isinstance(node, ast.Attribute):
-        return node.attr in ATTRIBUTES
-    return isinstance(node, ast.Name) and node.id in NAMES
+    elif isinstance(node, (ast.Set, ast.NamedExpr)):
+        inner = [one for one in inner if isinstance(one, ast.Constant)]
+    elif isinstance(node, ast.Call):
+        called = ast.unparse(node.func)
+        if called == "isinstance":
+            return bool({one.id for one in ast.walk(node) if isinstance(one, ast.Name)} & TABLES)
+        through = isinstance(node.func, ast.Attribute) and node.func.attr in ("any", "all")
+        inner = [node.func.value] if through else node.args if called in THROUGH else []  # pyright: ignore
+    return any(map(_asks, inner))
 
 
 def test_no_branches_on_a_kind() -> None:
-    assert branches(PACKAGE) == {}
+    paths = [path for room in ROOMS for path in sorted((PACKAGE / room).rglob("*.py"))]
+    names = {path.relative_to(PACKAGE).as_posix(): lines_of(path.read_text(encoding="utf-8")) for path in paths}
+    assert {name: lines for name, lines in names.items() if lines and name not in OF_DEVICES} == {}
 
 
 def test_one_table_of_the_priors_of_places() -> None:

@@ -4,12 +4,9 @@ And a package that only shrinks: its lines and those of each of its folders are 
 """
 
 import ast
-import io
 import json
-import tokenize
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import diffeo_calib
@@ -24,27 +21,13 @@ FILES = sorted(path for folder in FOLDERS for path in (REPOSITORY / folder).rglo
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-@cache
-def lines_with_code(source: str) -> set[int]:
-    """Lines that hold more than comments and blanks."""
-    blank = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
-    lines: set[int] = set()
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type not in blank:
-            lines.update(range(token.start[0], token.end[0] + 1))
-    return lines
-
-
 def code_lines(function: Function, source: str) -> int:
-    """Number of lines with code that belong to a function, without its docstring; at most those that it spans."""
-    last = function.end_lineno or 0
-    if last - function.lineno < MOST_CODE_LINES:
-        return last - function.lineno + 1
-    own = lines_with_code(source) & set(range(function.lineno, last + 1))
+    """Number of lines that hold more than comments and blanks, without the docstring."""
+    lines, first = source.split("\n"), function.body[0]
+    own = set(range(function.lineno, (function.end_lineno or 0) + 1))
     if ast.get_docstring(function) is not None:
-        first = function.body[0]
         own -= set(range(first.lineno, (first.end_lineno or 0) + 1))
-    return len(own)
+    return sum(not lines[number - 1].strip().startswith("#") for number in own if lines[number - 1].strip())
 
 
 def parameters(function: Function) -> int:

@@ -311,8 +311,11 @@ def with_measured(source: Source) -> Source:
     return source
 
 
-def with_units(source: Source) -> Source:
+def with_units(source: Source, *, seeks: bool = True) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
+
+    Args:
+        seeks: whether other meanings are sought, which takes long, where the columns as they are explain too little.
 
     Raises:
         InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
@@ -342,7 +345,10 @@ def with_units(source: Source) -> Source:
         return turned
     if best.left == inf:
         best.share()  # says why
-    if best.left >= DOUBTFUL and any(periodic) and (meant := _with_meanings(best)) is not best:
+    doubtful = best.left >= DOUBTFUL and any(periodic)
+    if doubtful and not seeks:
+        raise InputError("the robot does not explain the joints as they are.")
+    if doubtful and (meant := _with_meanings(best)) is not best:
         return meant
     if not clear:
         raise _unclear(ways, excluded=excluded)
@@ -387,7 +393,8 @@ def _unclear(ways: Sequence[Source], *, excluded: bool) -> InputError:
             fix += "the controller states them, negative where it counts the other way"
             return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
     for way, data in _of_one_size(ways[0]):
-        fix = likely_mistakes.likely_mistake(way.robot, data, way.left * spread(data.points)) or fix
+        mistakes = [group for group in likely_mistakes.EVERY_GROUP if group is not likely_mistakes.other_conventions]
+        fix = likely_mistakes.likely_mistake(way.robot, data, way.left * spread(data.points), mistakes) or fix
         third = len(data) // 3
         for name, rows in (("first", range(third)), ("last", range(len(data) - third, len(data)))):
             part = data.rows(list(rows))

@@ -13,22 +13,17 @@ def campaign(tmp_path: Path, text: str) -> str:
     return str(tmp_path / "cell.toml")
 
 
-def test_entries_become_options(tmp_path: Path) -> None:
+def test_entries_become_options_and_typed_ones_replace_them(tmp_path: Path) -> None:
     text = 'csv = "a.csv"\nrobot = "r.urdf"\nposition = ["x,y,z", "u,v,w"]\njoints = ["q1", "q2"]\nholdout = 0.2\n'
     words = expanded(["fit", campaign(tmp_path, text), "--holdout", "0"])
     table = [str(tmp_path / "a.csv"), "--robot", str(tmp_path / "r.urdf")]
     markers = ["--position", "x,y,z", "--position", "u,v,w", "--joints", "q1,q2"]
     assert words == ["fit", *table, *markers, "--holdout", "0"]
+    for typed in (["--tip", "flange"], ["--tip=flange"]):  # a tip beside those of the file would be another arm
+        text = 'csv = "a.csv"\ntip = ["one", "two"]\nholdout = 0.2\n'
+        assert expanded(["fit", campaign(tmp_path, text), *typed])[2:] == ["--holdout", "0.2", *typed]
     for other in (["fit", "a.csv"], ["evaluate", "a.toml"], ["fit"], []):
         assert expanded(other) == other
-
-
-@pytest.mark.parametrize("typed", [["--tip", "flange"], ["--tip=flange"]])
-def test_typed_options_replace_those_of_the_file(tmp_path: Path, typed: list[str]) -> None:
-    """A tip beside those of the file would be another arm."""
-    text = 'csv = "a.csv"\ntip = ["one", "two"]\nholdout = 0.2\n'
-    words = expanded(["fit", campaign(tmp_path, text), *typed])
-    assert words[2:] == ["--holdout", "0.2", *typed]
 
 
 @pytest.mark.parametrize(

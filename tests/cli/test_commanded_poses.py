@@ -299,23 +299,6 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
     assert float((z @ z.mT).min()) < 0.97
 
 
-@pytest.mark.parametrize(
-    ("pose", "options", "message"),
-    [
-        *(
-            (f"{POSE}={convention}", ["--angle", angle], f"poses fit with --robot-pose {POSE}=xyz --angle deg")
-            for convention, angle in (("XYZ", "deg"), ("xyz", "rad"))
-        ),
-        (f"{POSE}=xyz", ["--angle", "deg", "--robot", "t.csv"], "--robot, --base or --tip beside --robot-pose"),
-        (f"{POSE}=xyz", ["--angle", "deg", "--joints", POSE], "--joints beside --robot-pose"),
-    ],
-)
-def test_poses_that_are_refused(pose: str, options: list[str], message: str, command: Command, tmp_path: Path) -> None:
-    table = from_the_tool(tmp_path / "t.csv", flange())
-    given = ["--robot-pose", pose, "--length", "mm", *(table if word == "t.csv" else word for word in options), *SEEN]
-    assert message in command.failed("fit", table, *given, "-o", tmp_path / "m")
-
-
 @pytest.mark.slow
 def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any) -> None:
     commanded = places(80)

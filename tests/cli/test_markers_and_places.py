@@ -69,24 +69,6 @@ def test_init_joins_two_files_and_finds_the_markers(files: Files, tmp_path: Path
     assert written["length"] == "mm"
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["fit", "JOINTS", "--places", "PLACES"], "--places without --by"),
-        (["fit", "JOINTS", "--by", "name"], "--by without --places"),
-        (["campaign", "JOINTS", "--places", "PLACES", "--by", "name"], "--places or --marker, of a table that grows"),
-        (["campaign", "WHOLE", "--marker", "reflector"], "--places or --marker, of a table that grows"),
-        (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "--marker (reflector): expected one position"),
-    ],
-)
-def test_options_that_do_not_go_together(words: list[str], message: str, files: Files, command: Command) -> None:
-    named = {"JOINTS": files.joints, "WHOLE": files.whole, "PLACES": files.places}
-    given = ["--robot", files.urdf, "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "deg"]
-    output = ["-o", files.urdf.with_name("m.safetensors")] * (words[0] == "fit")
-    done = command(*(named.get(word, word) for word in words), *given, "--position", "x,y,z", *output)
-    assert message in done.error
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 from command_bank import FORMAT, Command, Site
 
@@ -60,23 +59,3 @@ def test_poses_to_measure_again(site: Site, model: dc.CalibratedKinematics, comm
     assert rms[2] > 0.01 > rms[3]
     assert "fewer than 3 poses do not show where the measuring device is now" in done.out
     assert f"{1e3 * float(rms[0]):.3f}" not in done.out  # its place, and no error of the robot
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ([], "what to plan for: expected a MODEL, or --robot, got neither"),
-        (["MODEL", "--base", "x"], "--base beside MODEL"),
-        (["ROBOT", "--free", "base"], "--free without MODEL"),
-        (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 or 6 or 7 numbers"),
-        (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
-        (["ROBOT", "--candidates", "CSV", "--draw", "9"], "--draw beside --candidates"),
-        (["ROBOT", "--candidates", "CSV", "-n", "99"], "at most 30, got 99"),
-        (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
-    ],
-)
-def test_mistakes(options: list[str], message: str, small_site: Site, sound_path: Path, command: Command) -> None:
-    words = {"MODEL": [sound_path], "ROBOT": small_site.robot(), "CSV": [small_site.csv]}
-    arguments = [word for option in options for word in words.get(option, [option])]
-    assert message in command.failed("plan", "-n", 3, "-o", small_site.folder / "poses.csv", *UNITS, *arguments)
-    assert not (small_site.folder / "poses.csv").exists()

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
-import torch
-from campaigns import CAMPAIGNS
 from command_bank import FORMAT, POSITION, TABLE, Command
 from product_bank import Case, simulated
 from torch import Tensor
@@ -49,20 +46,6 @@ def written(path: Path, q: Tensor) -> str:
     data = dc.Measurements(q, robot.true_points(q), joint_names=robot.nominal.joint_names, doubt=False)
     write_measurements(path, data, FORMAT, position=[POSITION.split(",")])
     return str(path)
-
-
-def test_other_markers_that_the_rows_leave_open(files: dict[str, str], tmp_path: Path, command: Command) -> None:
-    """The tool is only turned about the vertical, which does not show how high the marker is."""
-    q = CAMPAIGNS["tool turned about the vertical"](simulated(1)[0], 12, torch.Generator().manual_seed(5))
-    table = written(tmp_path / "upright.csv", q)
-    options = *TABLE, "--free", "both"
-    found = command("recalibrate", files["old.safetensors"], table, *options, "-o", str(tmp_path / "new.safetensors"))
-    compared = command("recalibrate", files["old.safetensors"], table, *options)
-    for done in (found, compared):
-        assert done.code == 0
-        assert re.search(r"the place of the marker on 'flange' along \(.*\) is known to \d\d mm only", done.err)
-        assert "unmoved" not in done.out  # other markers were named
-    assert re.search(r"mm from where they were \(these rows show that to \d\d mm\), or are other ones", found.out)
 
 
 def test_rows_that_test_no_change(arm: Case, files: dict[str, str], tmp_path: Path, command: Command) -> None:

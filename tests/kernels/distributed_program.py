@@ -1,9 +1,6 @@
-"""What the tests of distributed sums run in every process: `python distributed_program.py TASK FOLDER`."""
+"""What the tests of distributed sums run in every process: `python distributed_program.py FOLDER`."""
 
-import os
-import signal
 import sys
-import time
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,11 +16,6 @@ from diffeo_calib.kernels.reductions import backends, distributed
 from diffeo_calib.regression import control_points
 
 COUNT, ROWS = 300, 200
-
-
-def everything_shared() -> None:
-    backends.BACKENDS["distributed"] = distributed.Distributed(smallest=1)
-    control_points.SHARED_ENTRIES = 1
 
 
 def sums(backend: backends.Backend) -> list[Tensor]:
@@ -47,35 +39,13 @@ def fits(backend: backends.Backend) -> list[Tensor]:
 
 
 def agree(folder: Path) -> None:
-    everything_shared()
+    backends.BACKENDS["distributed"] = distributed.Distributed(smallest=1)
+    control_points.SHARED_ENTRIES = 1
     found: dict[str, Any] = {make.__name__: make("distributed") for make in (sums, fits)}
     found["alone"] = {make.__name__: make("dense") for make in (sums, fits)}
     torch.save(found, folder / f"found_{distributed.ranks().own}.pt")
 
 
-def lost(folder: Path) -> None:
-    """Rank 1 dies in the third sum; the other one must not write its model."""
-    everything_shared()
-    own, sums_done = distributed.ranks(), 0
-    original = distributed.Ranks.check_agreement
-
-    def check(self: distributed.Ranks, what: str, numbers: Tensor) -> None:
-        nonlocal sums_done
-        sums_done += 1
-        if own.own == 1 and sums_done == 3:
-            os.kill(os.getpid(), signal.SIGKILL)
-        original(self, what, numbers)
-
-    distributed.Ranks.check_agreement = check
-    begin = time.monotonic()
-    try:
-        fit = dc.fit(rr_problem(8), integrator=dc.RK4(2), backend="distributed")
-        dc.save(fit.model, folder / "model.safetensors")
-    except dc.DiffeoCalibError as error:
-        print(f"{type(error).__name__} after {time.monotonic() - begin:.1f} s: {error}")
-        sys.exit(7)
-
-
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    {"agree": agree, "lost": lost}[sys.argv[1]](Path(sys.argv[2]))
+    agree(Path(sys.argv[1]))

@@ -53,36 +53,32 @@ def test_the_users_folder_is_used_and_closed_to_others(tmp_path: Path) -> None:
     assert stat.S_IMODE(own.stat().st_mode) == 0o700
 
 
-def _mode(mode: int, levels: int) -> Callable[[Path], None]:
-    return lambda own: (own, *own.parents)[levels].chmod(mode)
+def _link(own: Path, mode: int) -> None:
+    """A link in place of a folder."""
+    elsewhere = own.with_name("elsewhere")
+    own.rename(elsewhere)
+    own.symlink_to(elsewhere)
+    elsewhere.chmod(mode)
 
 
-def _foreign(levels: int) -> Callable[[Path], None]:
-    return lambda own: os.chown((own / "code", own, *own.parents)[levels], STRANGER, -1)
-
-
-def _link(levels: int, mode: int) -> Callable[[Path], None]:
-    """A folder in place of which there is a link to it."""
-
-    def put(own: Path) -> None:
-        place, elsewhere = (own, *own.parents)[levels], own.parents[2] / "elsewhere"
-        place.rename(elsewhere)
-        place.symlink_to(elsewhere)
-        elsewhere.chmod(mode)
-
-    return put
-
-
-UNSAFE: dict[str, Callable[[Path], None]] = {
-    "writable by the group": _mode(0o775, 0),
-    "writable by all": _mode(0o777, 0),
-    "writable by all, sticky": _mode(0o1777, 0),
-    "a folder above it writable by the group": _mode(0o770, 1),
-    "the cache writable by all": _mode(0o777, 2),
-    "a link to a writable folder": _link(0, 0o777),
+UNSAFE: dict[str, Callable[[Path], object]] = {
+    "writable by the group": lambda own: own.chmod(0o775),
+    "writable by all": lambda own: own.chmod(0o777),
+    "writable by all, sticky": lambda own: own.chmod(0o1777),
+    "a folder above it writable by the group": lambda own: own.parent.chmod(0o770),
+    "the cache writable by all": lambda own: own.parents[1].chmod(0o777),
+    "a link to a writable folder": lambda own: _link(own, 0o777),
 }
-FOREIGN = {"a file": _foreign(0), "the folder": _foreign(1), "a folder above it": _foreign(2), "the cache": _foreign(3)}
-SAFE = {"a shared folder that keeps files of their owners": _mode(0o1777, 2), "a link to the cache": _link(2, 0o755)}
+FOREIGN: dict[str, Callable[[Path], object]] = {
+    "a file": lambda own: os.chown(own / "code", STRANGER, -1),
+    "the folder": lambda own: os.chown(own, STRANGER, -1),
+    "a folder above it": lambda own: os.chown(own.parent, STRANGER, -1),
+    "the cache": lambda own: os.chown(own.parents[1], STRANGER, -1),
+}
+SAFE: dict[str, Callable[[Path], object]] = {
+    "a shared folder that keeps files of their owners": lambda own: own.parents[1].chmod(0o1777),
+    "a link to the cache": lambda own: _link(own.parents[1], 0o755),
+}
 
 
 @pytest.mark.parametrize("case", [*UNSAFE, *(pytest.param(case, marks=as_root) for case in FOREIGN)])
