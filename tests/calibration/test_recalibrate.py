@@ -31,6 +31,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.drift import grown, parts_of
 from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
+from diffeo_calib.calibration.recalibration.register import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
@@ -390,14 +391,14 @@ def test_ratios_are_those_of_the_definition() -> None:
         assert found[name].variance == pytest.approx(float(SIZES[best.argmax()]))
 
 
-# --- rows that are doubted or refused ---------------------------------------------------------------------------------
-
-
 def test_known_noise_of_the_new_rows_counts() -> None:
     noisy = dc.Measurements(measured().q, measured().points + normal(NEW, 1, 3, seed=3, size=1e-3), std=1e-3)
     found = dc.recalibrate(old(), noisy, drift="none")
     assert found.outliers == ()
     assert covered(found.model, measured(rows=200, seed=6)) > 0.9
+    noisy.std[0] *= 2.0  # by which rows differ, whatever a usual row errs by
+    noise = weighed(place_again(old(), with_attributes(noisy, std=1e-2 * noisy.std)), "same").noise
+    assert_close(noise[0] - noise[1], 3e-10 * torch.eye(3, dtype=torch.float64), rtol=1e-4, atol=1e-14)
 
 
 def test_what_is_warned_about() -> None:

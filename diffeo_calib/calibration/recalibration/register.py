@@ -189,8 +189,6 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
 def weighed(set_up: NewSetUp, marker: str, *, opens: bool = False) -> NewRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable.
 
-    Rows have the noise of a typical old row, or their own where it is larger.
-
     Args:
         set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
         opens: whether something may have changed among the rows.

@@ -433,6 +433,10 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
             f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20), fix=fix
         )
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms
+    words = [{SIDES.get(word, word) for name in arm.joints for word in column(name).words} for arm in arms]
+    said = [{SIDES.get(word, word) for name in arm.columns.names for word in column(name).words} for arm in arms]
+    both = set[str].intersection(*words)
+    arms = [arm for arm, own, names in zip(arms, words, said, strict=True) if (own - both) & names] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
