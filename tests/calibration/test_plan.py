@@ -194,7 +194,7 @@ def test_devices_of_a_fit_against_the_whole_covariance(name: str) -> None:
     q = ARM.sample(20, seed=8)
     plan = dc.plan(result.model, q, 5)
     sensors: Any = sensor_of(result.model)
-    known = result.placement[0].constants
+    known = result.placement[0].devices.constants
     told = slice(0, 3 if name == "heights" else None)  # the distance of a plane changes no slope
     found = {name: device.devices.constants for one in sensors for name, device in one.devices.items()}
     own = {name: int((known - constants)[:, told].norm(dim=1).argmin()) for name, constants in found.items()}
