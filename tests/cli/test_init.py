@@ -265,6 +265,8 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     q[:, 2] *= -1
     found, _ = proposed((["up", "one [rad]", "two [rad]"], q), (XYZ, points))
     assert found["joints"] == "up,one [rad],-{two [rad]}"
+    _, text = proposed((["q1", "q2"], q[:, [0, 2]]), (XYZ, points))
+    assert "2 numbered columns do not say which of 3 joints they are" in text
     q, points = lift(tmp_path)
     gon = q * q.new_tensor([1.0, GON, GON])
     found, _ = proposed((["up", "one [gon]", "two [gon]"], gon), (["East", "North", "Up"], points))

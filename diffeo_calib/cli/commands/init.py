@@ -308,8 +308,11 @@ def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
             except InputError as error:
                 refused.append(error)
     if not sources:
-        lacking = next((arm.lacking for arm in arms if arm.lacking), ())
-        more = f" No column is named after {few(lacking, 20)}." if lacking else ""
+        arm = next((arm for arm in arms if arm.lacking), None)
+        more = "" if arm is None else f" No column is named after {few(arm.lacking, 20)}."
+        if arm is not None and arm.columns.how.startswith("numbered"):
+            count, most = len(arm.joints), len(arm.joints) + len(arm.lacking)
+            more = f" {count} numbered columns do not say which of {most} joints they are: name them after the joints."
         raise type(refused[-len(arms)])(f"{refused[-len(arms)]}{more}")
     best, *_ = several = proposals.ranked(sources.values())
     if len(several) > 1 and not proposals.is_clear(several):
