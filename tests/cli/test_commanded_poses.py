@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import BOARD, CAMERA, DOWN, bent, cells, drawn, flange, seen, turned, without_frames, write_columns
+from commanded_bank import BOARD, CAMERA, DOWN, bent, cells, drawn, flange, seen, turned, write_columns
+from numbers_bank import rigid_rms
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -316,7 +317,7 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any
     field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
     assert field.shape == (32, 9)
     place, add, std = field.double().split(3, 1)
-    assert without_frames(bent(place + add), place) < 0.15 * without_frames(bent(place), place)
+    assert rigid_rms(bent(place + add), place) < 0.15 * rigid_rms(bent(place), place)
     expected = dc.load(tmp_path / "t.safetensors").predict(place, noise=False)[1][:, 0].diagonal(dim1=1, dim2=2).sqrt()
     assert_close(std, expected, rtol=0.05, atol=1e-7)  # the device stands upright
 
@@ -357,7 +358,7 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     header, *rows = cells(tmp_path / "p.csv")
     assert {row[header.index("status")] for row in rows} == {"reached"}
     sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3
-    assert without_frames(bent(sent), went) < 0.15 * without_frames(bent(went), went)
+    assert rigid_rms(bent(sent), went) < 0.15 * rigid_rms(bent(went), went)
     model: Any = dc.load(tmp_path / "t.safetensors")
     at, *ends = torch.zeros(3, 1, 2, dtype=torch.float64) + torch.eye(3, 2, dtype=torch.float64).roll(1, 0)[:, None]
     here, x, y = (model.tool_poses(one, frame="measuring")[0, :3, 3] for one in (at, *ends))

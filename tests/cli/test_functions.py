@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import cells, drawn, without_frames, write_columns
+from commanded_bank import cells, drawn, write_columns
 from documentation_bank import write_commanded_tables
+from numbers_bank import rigid_rms
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import MeasurementError
@@ -87,7 +88,7 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     kinematics = runpy.run_path("my_delta.py")["kinematics"]
     nominal, exact = kinematics(q), 1.001 * kinematics(q + torch.tensor([0.1, -0.05, 0.08]))  # without noise
     assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
-    assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * without_frames(nominal, exact)
+    assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * rigid_rms(nominal, exact)
     command.ran("plan", model, "-n", "3", *pose, "-o", "n.csv")
     assert cells(Path("n.csv"))[0] == ["x", "y", "z", "rank"]
     done = command.ran("correct", model, "targets.csv", *pose, "-o", "c.csv")
@@ -99,4 +100,4 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     command.ran("predict", model, again, "--robot-pose", "x,y,z", *MEASURED[2:], "-o", "a.csv")
     reached = [[float(cell) for cell in row[3:6]] for row in cells(Path("a.csv"))[1:]]
     wanted = nominal[:5] - nominal[:5].mean(0)
-    assert without_frames(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device
+    assert rigid_rms(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from table_bank import held, random_poses, says, some, values
+from numbers_bank import normal as values
+from table_bank import held, random_poses, says, some
 from torch.testing import assert_close
 
 import diffeo_calib as dc

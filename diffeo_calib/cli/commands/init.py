@@ -308,8 +308,11 @@ def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
             except InputError as error:
                 refused.append(error)
     if not sources:
-        lacking = next((arm.lacking for arm in arms if arm.lacking), ())
-        more = f" No column is named after {few(lacking, 20)}." if lacking else ""
+        arm = next((arm for arm in arms if arm.lacking), None)
+        more = "" if arm is None else f" No column is named after {few(arm.lacking, 20)}."
+        if arm is not None and arm.columns.how.startswith("numbered"):
+            count, most = len(arm.joints), len(arm.joints) + len(arm.lacking)
+            more = f" {count} numbered columns do not say which of {most} joints they are: name them after the joints."
         raise type(refused[-len(arms)])(f"{refused[-len(arms)]}{more}")
     best, *_ = several = proposals.ranked(sources.values())
     if len(several) > 1 and not proposals.is_clear(several):
@@ -433,6 +436,10 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
             f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20), fix=fix
         )
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms
+    words = [{SIDES.get(word, word) for name in arm.joints for word in column(name).words} for arm in arms]
+    said = [{SIDES.get(word, word) for name in arm.columns.names for word in column(name).words} for arm in arms]
+    both = set[str].intersection(*words)
+    arms = [arm for arm, own, names in zip(arms, words, said, strict=True) if (own - both) & names] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
