@@ -51,7 +51,7 @@ def posed() -> Case:
 def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
     robot = product_bank.sliding_robot()
-    train, test = product_bank.sliding_measurements(robot, 50), product_bank.sliding_measurements(robot, 300, seed=1)
+    train, test = product_bank.erring(robot, 50), product_bank.erring(robot, 300, seed=1)
     scales = usual_scales(robot).inflated(2.0)
     return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
 

@@ -8,6 +8,7 @@ import pytest
 import reading_bank
 import torch
 from kind_bank import ELSEWHERE, KINDS, Kind, kind_named
+from source_bank import tracked
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -46,7 +47,12 @@ LAWS: dict[str, Law] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_errors_do_not_change(kind: str) -> None:
+    """Predictions come back from a file bit by bit, those without torch nearly so."""
     own = kind_named(kind)
+    again, q = dc.load(own.file), own.q(20)
+    for ours, theirs in zip(again.predict(q), own.model.predict(q), strict=True):
+        assert_close(ours, theirs, rtol=0, atol=0)
+    assert_close(torch.from_numpy(dc.interop.load_numpy(own.file)(q.numpy())), again(q), rtol=0, atol=1e-11)
     rows = own.new.with_line_numbers(torch.arange(len(own.new)) + 100)
     expected = lines(own.model, rows)
     for law, changed in LAWS.items():
@@ -55,20 +61,6 @@ def test_the_errors_do_not_change(kind: str) -> None:
         for key, (name, errors) in expected.items():
             assert found[key][0] == name, law
             assert_close(found[key][1], errors, rtol=0, atol=1e-9, equal_nan=True, msg=law)
-
-
-SAVED = ("several tips", "sessions", "markers mounted anew", "ball in sockets", "mixture", "distances")
-"""Kinds whose models have more than joints and markers."""
-
-
-@pytest.mark.parametrize("kind", SAVED)
-def test_a_model_is_saved_whole(kind: str) -> None:
-    """Its predictions come back bit by bit, those without torch nearly so."""
-    own = kind_named(kind)
-    again, q = dc.load(own.file), own.q(20)
-    for ours, theirs in zip(again.predict(q), own.model.predict(q), strict=True):
-        assert_close(ours, theirs, rtol=0, atol=0)
-    assert_close(torch.from_numpy(dc.interop.load_numpy(own.file)(q.numpy())), again(q), rtol=0, atol=1e-11)
 
 
 def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
@@ -84,11 +76,9 @@ def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
 
 def wires(first: str = "wire", second: str = "interferometer") -> tuple[Any, ...]:
     arm = SimulatedArm(0, markers=2)
-    q, points = arm.measure(40, seed=5)
     tables = [reading_bank.readings(arm, "distance", 48, zero, noise=2e-5, seed=3 + bool(zero)) for zero in (0.0, 0.03)]
     names = [tuple(f"{name} {number}" for number in range(3)) for name in (first, second)]
-    both = [replace(own, names=each) for own, each in zip(tables, names, strict=True)]
-    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names), *both
+    return tracked(arm, 40, 5, 1), *(replace(own, names=each) for own, each in zip(tables, names, strict=True))
 
 
 def test_devices_with_and_without_a_known_zero() -> None:
@@ -124,18 +114,15 @@ def test_set_ups_of_other_markers_than_those_of_the_model_are_refused() -> None:
         dc.evaluate(kind_named("positions").model, kind_named("sessions").new)
 
 
-@pytest.mark.parametrize("verb", [dc.compare, dc.recalibrate])
 @pytest.mark.parametrize("name", ["sessions", "markers mounted anew"])
-def test_rows_of_one_set_up_of_several_are_rows_of_one(name: str, verb: Callable[[Any, Any], Any]) -> None:
+def test_rows_of_one_set_up_of_several_are_rows_of_one(name: str) -> None:
     """A part of a table knows the names of all of its set-ups."""
     kind = kind_named(name)
     rows = kind.new.rows([own == kind.new.device_names[0] for own in kind.new.device_names])
-    found, alone = verb(kind.model, rows), verb(kind.model, rows.with_sessions(None))
-    assert_close(torch.tensor(_rms(found)), torch.tensor(_rms(alone)), rtol=1e-6, atol=1e-9)
-
-
-def _rms(found: Any) -> float:
-    return getattr(found, "after", found).rms
+    for verb in (dc.compare, lambda *given: dc.recalibrate(*given).after):
+        assert verb(kind.model, rows).rms == pytest.approx(
+            verb(kind.model, rows.with_sessions(None)).rms, rel=1e-6, abs=1e-9
+        )
 
 
 def test_a_fit_whose_part_has_rows_of_one_set_up_is_a_fit_of_one() -> None:
@@ -161,16 +148,10 @@ def test_a_recalibration_with_rows_of_one_set_up_knows_where_all_of_them_are(nam
         assert judged.rms < 3e-4
 
 
-def lone_rows(rows: Any) -> Any:
-    """The first row of every socket, and all rows of other kinds."""
-    names = rows.device_names
-    return rows.rows([number for number, name in enumerate(names) if name not in names[:number] or not name])
-
-
 def test_a_row_alone_in_its_socket_shows_no_error() -> None:
     kind = kind_named("ball in sockets")
     names = kind.new.device_names
-    rows = kind.new.rows([number for number, name in enumerate(names) if name == names[0]] + [names.index("4/1")])
+    rows = kind.new.rows([*(k for k, name in enumerate(names) if name == names[0]), names.index("4/1")])
     found: Any = dc.evaluate(kind.model, rows)
     assert found.count == len(rows) - 1
     assert found.errors[-1].isnan()
@@ -181,8 +162,9 @@ def test_a_row_alone_in_its_socket_shows_no_error() -> None:
 @pytest.mark.parametrize("verb", [dc.evaluate, dc.compare, dc.recalibrate])
 def test_rows_that_are_all_alone_in_their_sockets_are_refused(verb: Callable[[Any, Any], Any]) -> None:
     kind = kind_named("ball in sockets")
+    lone = kind.new.rows([kind.new.device_names.index(name) for name in dict.fromkeys(kind.new.device_names)])
     with pytest.raises(dc.DiffeoCalibError, match=r"2 rows, each of them alone in its socket.*twice"):
-        verb(kind.model, lone_rows(kind.new))
+        verb(kind.model, lone)
 
 
 @pytest.mark.parametrize("name", ["several kinds", "inclinations", "images and a tracker"])
@@ -194,7 +176,6 @@ def test_devices_are_kept_where_positions_alone_are_registered(name: str) -> Non
     (measured,) = (part for part in parts if not part.without_device)
     for T in (torch.eye(4, dtype=torch.float64), twist_transform(0.5 * ELSEWHERE)):
         rows = measured.in_frames(T.expand(len(measured), 4, 4))
-        assert [own.names for own in model.registered(rows).placement] == names
         model = model.registered(rows, learn=False)  # else `recalibrate` would count them twice
         assert [own.names for own in model.placement] == names
     judged = dc.Observations.joined([rows, *(part for part in parts if part.without_device)])

@@ -14,6 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from math import log
 from typing import Literal
 
 from diffeo_calib.calibration.choose_scales import (
@@ -44,7 +45,9 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     warn_of_rounding,
 )
 from diffeo_calib.calibration.expected_errors import with_open_directions
+from diffeo_calib.calibration.placing.lens import EXACT_SIZE, BoardSize
 from diffeo_calib.calibration.placing.place import Placed, place
+from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.result import CalibrationResult, parts
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
@@ -186,6 +189,8 @@ def calibrate(
             placed, text = widened
             chosen = scales_for(placed.tangent_data(), measurements, *stages)
             warn_user(text)
+        if any(isinstance(part, BoardSize) for part in placed.placement):
+            placed, chosen = _of_exact_board(placed, chosen)
         devices, bodies = placed.placement.hypotheses(chosen.data, CHANGE), placed.placement.bodies
         judged = chosen.data, chosen.selection.scales, chosen.left_out, placed.data.line_numbers
         best = judge(
@@ -196,6 +201,19 @@ def calibrate(
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, best, note=note, warned=warned)
+
+
+TOLD_LOG_ODDS = log(10.0)  # before the rows are seen: of a board of the size that was told against a print
+
+
+def _of_exact_board(placed: Placed, chosen: ChosenScales) -> tuple[Placed, ChosenScales]:
+    """With a board of the size that its detector was told, unless rows are likelier of a print."""
+    sets = [part.of_std(EXACT_SIZE) if isinstance(part, BoardSize) else part for part in placed.placement]
+    exact, scales = replace(placed, placement=Placement(tuple(sets))), chosen.selection.scales
+    data = replace(chosen.data, shared=exact.placement.shared(chosen.data))
+    if chosen.data.process(scales).evidence > data.process(scales).evidence + TOLD_LOG_ODDS:
+        return placed, chosen
+    return exact, replace(chosen, data=data)
 
 
 def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: Progress) -> Fit:

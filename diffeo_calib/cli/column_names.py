@@ -51,6 +51,7 @@ SAID = WORDS["measured"] | WORDS["wished"] | WORDS["deviation"]
 GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "position", "trans", "tcp"} - {"q"}}
 GLUED |= {"d": "err", "e": "err", "s": "std"}
 """What stands before x, y or z in one word, and what it means."""
+AXES = {"east": "x", "easting": "x", "north": "y", "northing": "y", "up": "z"}
 SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_A-Za-z]+")
 LONGEST_LABEL = 6  # words of a name that are compared with one label
 
@@ -128,7 +129,7 @@ def _parts(word: str) -> list[str]:
         return [GLUED[word[:-1]], word[-1]]
     if word[0] in "xyzqj" and word[1:] in SAID | {"pos", "m", "mm"}:
         return [word[0], "meas" if word[1:] == "m" else word[1:]]
-    return [word]
+    return [AXES.get(word, word)]
 
 
 def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:

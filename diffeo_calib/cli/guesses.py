@@ -35,16 +35,20 @@ LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 
 DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
 NAMED = {
-    "session": ("session setup station anchor device plane", "the device, or its set-up, of every row"),
-    "payload": ("payload mass load", "the known mass that the robot carried"),
-    "time": ("time times timeh timestamp seconds minutes hours hour", DRIFT),
-    "temperature": ("temperature temp temperaturec tempc", DRIFT),
+    "session": ("session setup station anchor device plane aufstellung", "the device, or its set-up, of every row"),
+    "payload": (
+        "payload mass load nutzlast traglast carga 负载 負荷",
+        "the known mass that the robot carried",
+    ),
+    "time": ("time times timeh timestamp seconds minutes hours hour zeit zeits tiempo temps", DRIFT),
+    "temperature": ("temperature temp temperaturec tempc temperatur temperatura 温度", DRIFT),
 }
 """Option -> names by which a column besides the joints and what was measured is known, and what it holds."""
 JOINTS = "q0", "q1"
 """First names of four numbers that are joint values, rather than a quaternion, where they stand before a place."""
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
+DH_SIGNS = "θ", "theta", "d"
 ROTATIONS = (
     *(("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"), ("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")),
     *(tuple(f"{row}{k}" for row in index for k in index) for index in ("012", "123")),  # a matrix by rows
@@ -138,6 +142,13 @@ class JointColumns(NamedTuple):
     how: str
     rank: tuple[int, ...]
 
+    @property
+    def text(self) -> str:
+        """As a value of `fit --joints`: gon and mrad as expressions in degrees and rad."""
+        factors = {"gon": "0.9", "mrad": "0.001"}
+        units = [(name, factors.get(column(name).unit)) for name in self.names]
+        return ",".join(f"{factor}*{{{name}}}" if factor else name for name, factor in units)
+
 
 def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointColumns]:
     """Columns that may be those of the joints, the best first: speeds, torques and poses of the tool are none.
@@ -159,6 +170,9 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointCol
             continue
         for k in missing:
             names.insert(k, rails[0])
+        if missing and numbered and sorted(names, key=columns.index)[0] != rails[0] != max(names, key=columns.index):
+            names.sort(key=columns.index)  # E1 between the others: of seven axes
+            missing = [names.index(rails[0])]
         said = group.says("measured") or group.shared & {"position", "pos", "qpos"}
         unlike = [k for k in missing if not _is_external(joints[k])]
         rank = group.wished, bool(numbered and not group.says("joint")), not said, len(missing), len(unlike)
@@ -189,7 +203,22 @@ def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tupl
     series = [[f"{k + first:0{width}d}" for k in range(n)] for first in (0, 1) for width in (1, 2)]
     series += [["", *digits[:-1]] for digits in series if n > 1]  # the first joint is a rail
     labels += [("numbered in the order of the URDF's joints", digits) for digits in series]
-    return ((naming, how, group) for how, naming in labels for group in groups(columns, naming))
+    named = [(naming, how, group) for how, naming in labels for group in groups(columns, naming)]
+    mixed = Group((), (), _mixed(columns, full, bare))
+    return iter([(full, usual, mixed)] * bool(mixed.names) + named)
+
+
+def _mixed(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> dict[str, str]:
+    """Columns that are named after joints in part or by the first letters (x_axis, c, az), or as DH tables do (d3)."""
+    there = {column(name).plain: name for name in reversed(columns)}
+    starts = {text: [label for label in bare if label.startswith(text)] for text in there if len(text) > 1}
+    names = dict[str, str]()
+    for k, (whole_name, label) in enumerate(zip(full, bare, strict=True)):
+        texts = whole_name, label, *(f"{sign}{k + 1}" for sign in DH_SIGNS)
+        short = (text for text, labels in starts.items() if labels == [label])
+        if text := next((text for text in texts if text in there), next(short, "")):
+            names[whole_name] = there[text]
+    return names if len({*names.values()}) == len(full) else {}
 
 
 def _is_external(name: str) -> bool:

@@ -43,6 +43,7 @@ from diffeo_calib.sensors.kinds import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0  # a way is clear if every other one leaves more by this factor
 LARGEST_RESIDUAL = 0.1  # median residual, as a share of the spread, above which no way is right
+MOST_SESSIONS = 6
 DOUBTFUL = 0.01
 """Share of what the rows vary, left by the best units, above which other meanings of the joints are sought."""
 SMALLEST_PART = 0.1  # of a joint's limits that a table passes through, in the right unit
@@ -257,8 +258,8 @@ def with_joint_columns(source: Source, series: Sequence[guesses.JointColumns]) -
 
     Where it does not tell them apart either, each is a line that the user may choose.
     """
-    how = {",".join(entry.names): entry.how for entry in series}
-    equal, why = [",".join(entry.names) for entry in series if entry.rank == series[0].rank], ""
+    how = {entry.text: entry.how for entry in series}
+    equal, why = [entry.text for entry in series if entry.rank == series[0].rank], ""
     source = source.into(joints=equal[0])
     if len(equal) > 1:
         ways = ranked(way for names in equal for way in source.into(joints=names).in_units())
@@ -268,7 +269,7 @@ def with_joint_columns(source: Source, series: Sequence[guesses.JointColumns]) -
         if not alike and not is_clear([best, second], gates.READINGS_TOLD_APART):
             return source.asking("joints", {names: f"uncomment the right line: {how[names]}" for names in equal})
         source, why = source.into(joints=best.options.joints), f"; {reason(best, second)}"
-    for entry in (entry for entry in series[:4] if ",".join(entry.names) != source.options.joints):
+    for entry in (entry for entry in series[:4] if entry.text != source.options.joints):
         why += f"; not {entry.names[0]} to {entry.names[-1]}" + " (commanded)" * bool(entry.rank and entry.rank[0])
     return source.into({"joints": how[source.options.joints or ""] + why})
 
@@ -310,8 +311,11 @@ def with_measured(source: Source) -> Source:
     return source
 
 
-def with_units(source: Source) -> Source:
+def with_units(source: Source, *, seeks: bool = True) -> Source:
     """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
+
+    Args:
+        seeks: whether other meanings are sought, which takes long, where the columns as they are explain too little.
 
     Raises:
         InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
@@ -320,9 +324,12 @@ def with_units(source: Source) -> Source:
     if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):
         others = ranked([*ways, *source.in_units(slides=True)])
         ways = others if is_clear(others) else ways
-    if not any(periodic):  # all lengths in another unit are another size, which the rows do not show
-        low, high = source.robot.limits.unbind(1)
-        values = [(way, way.data.q) for way in ways if way.left < inf]
+    if ways[0].left >= DOUBTFUL and (moved := _in_sessions(source)) is not None:
+        return with_units(moved)
+    if not all(periodic) and not is_clear(ways):  # slides and places in another unit are another size of the machine
+        slides = ~torch.tensor(periodic, dtype=torch.bool, device=HOST)
+        low, high = source.robot.limits[slides].unbind(1)
+        values = [(way, way.data.q[:, slides]) for way in ways if way.left < min(DOUBTFUL, CLEAR_RATIO * ways[0].left)]
         inside = [(way, q.amax(0) - q.amin(0)) for way, q in values if bool(((q >= low) & (q <= high)).all())]
         if chosen := [way for way, moved in inside if float((moved / (high - low)).max()) > SMALLEST_PART]:
             ways, why = chosen, ", by the limits of the joints: the numbers leave it open"
@@ -330,11 +337,18 @@ def with_units(source: Source) -> Source:
     if not is_clear(ways) and 0 < len(named) < len(ways) and named[0].left < CLEAR_RATIO * ways[0].left:
         ways, why = named, ", by the names of the columns: the numbers leave it open" + why
     best, clear = ways[0], is_clear(ways)
+    near = [way for way in ways if way.left < CLEAR_RATIO * best.left]
+    lengths = {way.options.length or "": "the robot explains the rows in each: uncomment the unit" for way in near}
+    if not clear and best.left < DOUBTFUL and len(lengths) == len(near) and all(periodic):  # axes through one point
+        return best.into({"angle": reason(best)}).asking("length", lengths)
     if not clear and (turned := with_rotation(source, camera=True)) is not source:
         return turned
     if best.left == inf:
         best.share()  # says why
-    if best.left >= DOUBTFUL and any(periodic) and (meant := _with_meanings(best)) is not best:
+    doubtful = best.left >= DOUBTFUL and any(periodic)
+    if doubtful and not seeks:
+        raise InputError("the robot does not explain the joints as they are.")
+    if doubtful and (meant := _with_meanings(best)) is not best:
         return meant
     if not clear:
         raise _unclear(ways, excluded=excluded)
@@ -342,6 +356,17 @@ def with_units(source: Source) -> Source:
     if source.without_length and all(periodic):
         return best.into({"length": "of lengths that you add: the table holds none", "angle": why})
     return best.into({"length": why})
+
+
+def _in_sessions(source: Source) -> Source | None:
+    """With a column of texts as the set-ups of the device, in each of which the robot explains the rows."""
+    cells = source.sheet.cells if source.bodies and source.options.session is None else {}
+    texts = (name for name in cells if name not in (*source.sheet.numbers, *source.joints))
+    for name in (name for name in texts if 1 < len({*cells[name]}) <= MOST_SESSIONS):
+        way = source.into({"session": "in each of its set-ups the robot explains the rows, not in all"}, session=name)
+        if way.units[0].left < DOUBTFUL:
+            return way
+    return None
 
 
 def _unclear(ways: Sequence[Source], *, excluded: bool) -> InputError:
@@ -368,7 +393,8 @@ def _unclear(ways: Sequence[Source], *, excluded: bool) -> InputError:
             fix += "the controller states them, negative where it counts the other way"
             return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
     for way, data in _of_one_size(ways[0]):
-        fix = likely_mistakes.likely_mistake(way.robot, data, way.left * spread(data.points)) or fix
+        mistakes = [group for group in likely_mistakes.EVERY_GROUP if group is not likely_mistakes.other_conventions]
+        fix = likely_mistakes.likely_mistake(way.robot, data, way.left * spread(data.points), mistakes) or fix
         third = len(data) // 3
         for name, rows in (("first", range(third)), ("last", range(len(data) - third, len(data)))):
             part = data.rows(list(rows))
@@ -413,8 +439,13 @@ def _with_meanings(best: Source) -> Source:
         places = (best if len(way.bodies) < len(best.bodies) else way).options.position
         whole = replace(way, bodies=best.bodies).into({"length": "with these joints"}, position=places)
         text = next(iter(meant))
+        for points in data.bodies.mirrored(data):  # of a robot with a plane of symmetry the signs of axes do the same
+            reading = likely_mistakes.Reading.of(way.robot, data)._replace(points=points)
+            if (left := likely_mistakes.registered(reading)[0] / spread(points)) < DOUBTFUL:
+                why = f"in a left-handed frame, which leaves {percent(left)}: exchange two columns of the places too"
+                meant = {best.options.joints or "": f"{why}; uncomment one"} | meant
         explained = with_measured(whole.into({"joints": meant[text]}, joints=text))  # only now
-        return explained.asking("joints", meant) if len(meanings) > 1 else explained
+        return explained.asking("joints", meant) if len(meant) > 1 else explained
     return best
 
 
@@ -431,6 +462,8 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     numbers = len(turned[0].turn)
     own_body = len(bodies) == max(len(source.options.tip or ()), 1) == len(turned)
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == numbers] if own_body else []
+    if numbers == 4 and all(column(body.turn[3]).words[-1].endswith("w") for body in turned):
+        conventions = ["quat_xyzw"]  # so the names say
     turns = list(product(conventions, ("deg", "rad") if numbers == 3 else (None,)))
     given = {"rotation": [",".join(body.turn) for body in turned], "camera_on_tool": camera}
     units = source.in_units() if camera else [source]

@@ -25,6 +25,7 @@ except ImportError:  # Windows, where leftovers stay
 
 
 SUFFIX = ".part"
+QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"  # quotation marks, dashes and the like in cp1252
 LONGEST_STEM = 200  # bytes of a file's name that are part of the name of its temporary file; names have 255 at most
 FULL = "free some space, or name a file on another disk"
 FIXES = {
@@ -149,6 +150,18 @@ def read_regular(path: Path, kind: str, most: int, error: type[InputError] = Inp
         what, expected = f"'{path}' is too large for a {kind}", f"at most {most // 10**6} MB"
         raise error.of(what, expected=expected, fix=f"pass the {kind} itself")
     return content
+
+
+def decoded(data: bytes) -> tuple[str, str]:
+    """The text of a file, and its code page where that is not UTF-8."""
+    try:
+        return data.decode("utf-8-sig"), ""
+    except UnicodeDecodeError:  # Chinese has pairs of high bytes, usual ones below 0xD8; Japanese begins with others
+        words = [word for word in re.findall(rb"[\x80-\xff]+", data) if word.strip(QUOTES)]
+        pairs = words and all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words) and min(words)[0] < 0xD8
+        japanese = 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words)
+        page = "gb18030" if pairs else "cp932" if japanese else "cp1252"
+        return data.decode(page, "replace"), page
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan, pi
@@ -17,15 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.common.errors import RobotError, few, shown
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import decoded, read_regular
 from diffeo_calib.robots.dh import LARGEST_ANGLE_RAD, LONGEST_LINK_M, DHRow, from_dh
 from diffeo_calib.robots.tree import Chain
 
 NUMBERS = {
-    "a": "a linklength",
-    "alpha": "alpha linktwist twist",
-    "d": "d linkoffset",
-    "theta": "theta jointangle thetaoffset",
+    "a": "a linklength lange gliedlange longitud longueur lunghezza",
+    "alpha": "alpha linktwist twist verdrehung verwindung torsion torsione",
+    "d": "d linkoffset versatz gelenkversatz desplazamiento decalage",
+    "theta": "theta jointangle thetaoffset drehwinkel gelenkwinkel angulo",
     "beta": "beta",
     "offset": "offset jointoffset qoffset",
     "lower": "min lower qmin lowerlimit minlimit",
@@ -33,7 +34,7 @@ NUMBERS = {
 }
 """Number of a joint -> letters of its column's name."""
 TEXTS = {
-    "name": "joint name jointname frame link axis i no gelenk achse",
+    "name": "joint name jointname frame link axis i no gelenk achse articulacion eje axe",
     "kind": "type kind jointtype sigma",
     "unread": "mimic x y z roll pitch yaw",
     "convention": "convention dhconvention",
@@ -42,7 +43,8 @@ KINDS = {
     **dict.fromkeys(("revolute", "r", "rotary", "rotational", "continuous", "0"), "revolute"),
     **dict.fromkeys(("prismatic", "p", "linear", "slide", "translational", "1"), "prismatic"),
 }
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "rad": 1.0, "deg": pi / 180}
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254, "rad": 1.0, "deg": pi / 180}
+SPELLED = {"°": "deg", "grad": "deg", "in": "inch"}
 WORDS = {"standard": "classic|classical|sdh", "craig": "craig|mdh"}
 """Words of a file's comments, or of its name, that say its convention."""
 USUAL = {
@@ -52,7 +54,7 @@ USUAL = {
 """Words with other meanings: they count as the cell of a column, as all of a comment, or beside these:"""
 TOPIC = "dh|denavit|conventions?|parameters?"
 PLAIN = str.maketrans({"α": "alpha", "θ": "theta", "ϑ": "theta", "β": "beta", "π": "pi", "−": "-", "$": "", "\\": ""})
-UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|rad|deg|grad|°)(?:ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
+UNIT = re.compile(r"(?:[\[(]\s*|[_ ,/])(mm|cm|m|in|rad|deg|grad|°)(?:ch|ians?|rees?)?(?:\s*[\])]|$)", re.IGNORECASE)
 INDEXED = re.compile(r"(a|alpha|d|theta)[_ ]*[{(]?\s*(?:[ijkn](\s*-\s*1)?|(prev)\w*)\s*[})]?")
 VALUE = re.compile(r"(?:^|\+)(?:q|theta|th|d)_?\{?\d*\}?\*?(?=$|[+-])")
 """The joint's own value in a cell, such as q1 or theta_1*."""
@@ -78,7 +80,7 @@ class DHFile:
 
         Raises RobotError: no such table, a cell that is no number, no unit of angles or limits, or two conventions.
         """
-        text = read_regular(path, "robot's description", LARGEST_FILE, RobotError).decode("utf-8-sig", "replace")
+        text = decoded(read_regular(path, "robot's description", LARGEST_FILE, RobotError))[0]
         lines = [line.strip() for line in text.translate(PLAIN).splitlines() if line.strip(" \t-:|+")]
         header, cells, notes = _cells(path, lines)
         rows = [_named(list(map(_what, header)), row) for row in cells]
@@ -86,7 +88,8 @@ class DHFile:
         if len(said) > 1:
             expected = "standard or craig (modified), in one place"
             raise RobotError.of(f"'{path}' names two conventions", expected=expected)
-        own = {_what(cell): re.sub("°|grad", "deg", unit[1].lower()) for cell in header if (unit := UNIT.search(cell))}
+        stated = {_what(cell): unit[1].lower() for cell in header if (unit := UNIT.search(cell))}
+        own = {what: SPELLED.get(unit, unit) for what, unit in stated.items()}
         units = _units(path, rows, own)
         names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
         names = [f"joint_{name}" if name.isdecimal() else name for name in names]
@@ -147,7 +150,7 @@ def _split(line: str, sep: str) -> list[str]:
 
 def _bare(cell: str) -> str:
     """A name in the header without its unit."""
-    return UNIT.sub("", cell, count=1).strip().lower()
+    return unicodedata.normalize("NFKD", UNIT.sub("", cell, count=1).strip().lower())
 
 
 def _what(cell: str) -> str:

@@ -29,7 +29,7 @@ class Planes(Devices):
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
-        return {"height": ("height", "gauge", "dial", "dial_gauge", "indicator")}
+        return {"height": ("height", "gauge", "dial", "dial_gauge", "indicator", "messuhr")}
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

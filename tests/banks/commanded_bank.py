@@ -5,17 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from numbers_bank import normal as drawn
 from torch import Tensor
 
-from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import transforms
 
 ROWS = 24
 DOWN = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-
-
-def drawn(*shape: int, seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def turned(axes: Tensor) -> Tensor:
@@ -62,9 +58,3 @@ def bent(places: Tensor) -> Tensor:
 
 def cells(path: Path) -> list[list[str]]:
     return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
-
-
-def without_frames(there: Tensor, wanted: Tensor) -> float:
-    """RMS distance, m, wherever the measuring frame is."""
-    T = rigid_fit(there, wanted)
-    return float((there @ T[:3, :3].mT + T[:3, 3] - wanted).square().sum(1).mean().sqrt())

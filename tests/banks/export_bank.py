@@ -8,6 +8,7 @@ import pytest
 import torch
 from deformation_bank import geometry_of
 from robots_bank import draw
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -98,19 +99,13 @@ def rigid_model(case: dc.CalibratedKinematics, truth: Geometry) -> dc.Calibrated
     deformation = case.map.geodesic
     spec = deformation.spec
     errors = torch.linalg.inv(case.nominal.geometry.joint_errors) @ truth.joint_errors
-    from_errors = [torch.cat([E[:3, 3], _rotation_vector(E[:3, :3])]) for E in errors]
+    turns = torch.from_numpy(Rotation.from_matrix(errors[:, :3, :3].numpy()).as_rotvec())
     theta = torch.zeros(case.nominal.parameters, dtype=torch.float64)
-    theta[case.nominal.geometry.slices["joints"]] = torch.cat(from_errors)
+    theta[case.nominal.geometry.slices["joints"]] = torch.cat([errors[:, :3, 3], turns], 1).flatten()
     b, p, _ = (torch.zeros_like(t) for t in deformation.momenta.tensors)
     still = GeodesicDeformation(spec, deformation.x, Momenta(b, p, theta), deformation.integrator)
     fitted = FittedMap(still, case.map.noise, case.map.data, case.map.new_noise)
     return dc.CalibratedKinematics(case.robot, fitted, case.summary, lever=case.lever)
-
-
-def _rotation_vector(R: Tensor) -> Tensor:
-    from scipy.spatial.transform import Rotation
-
-    return torch.from_numpy(Rotation.from_matrix(R.numpy()).as_rotvec())
 
 
 def changed_lines(before: bytes, after: bytes) -> Sequence[tuple[bytes, bytes]]:

@@ -1,10 +1,12 @@
 """Tables of a simulated arm for `init`; measured with a tracker, in sockets, and by a wire from two anchors."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from numbers_bank import normal
 from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
@@ -14,16 +16,13 @@ ARM, ROWS = SimulatedArm(seed=3), 40
 NAMES, XYZ = list(ARM.nominal.joint_names), ["x", "y", "z"]
 SERIES = [f"j{k}" for k in range(1, 7)]
 Proposed = Callable[..., tuple[dict[str, Any], str]]
+noise = partial(normal, seed=1)
 
 
 def rows() -> tuple[Tensor, Tensor]:
     """Joint values, deg, and places, mm."""
     q, points = ARM.measure(ROWS, seed=0)
     return q.rad2deg(), 1e3 * points[:, 0]
-
-
-def noise(*shape: int, size: float) -> Tensor:
-    return size * torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
 def reasons(text: str) -> dict[str, str]:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 import two_arms_bank
+from numbers_bank import drawn, rigid_rms, tensor
 from shared_bank import shared
 from source_bank import KINDS, SOURCES, Source
 from torch import Tensor
@@ -30,9 +31,9 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
-ELSEWHERE = torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64)
+ELSEWHERE = tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3])
 """Where the device stands later: shift in m, turn in rad."""
-TOOL = twist_transform(torch.tensor([0, 0, 0.1, 0, 0, 0], dtype=torch.float64))
+TOOL = twist_transform(tensor([0, 0, 0.1, 0, 0, 0]))
 UNITS = ("--length", "mm", "--angle", "deg")
 FOLDER = tempfile.TemporaryDirectory(prefix="diffeo_calib_kinds_")  # of all kinds, until this process ends
 QUICK = ("positions", "poses", "mixture", "heights")
@@ -135,13 +136,12 @@ class Kind:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""
         if self.name in CAMERAS:
             return self.source.rows.q[:count]
-        draw = torch.rand(count, self.robot.n, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
         low, high = self.data.q.min(0).values, self.data.q.max(0).values
-        return low + (high - low) * (0.1 + 0.8 * draw)
+        return low + (high - low) * (0.1 + 0.8 * drawn(count, self.robot.n, seed=5))
 
     def error_mm(self, points: Tensor, q: Tensor) -> float:
         """RMS distance of points (N, P, 3) at q from the true ones after a rigid fit, mm."""
-        return 1e3 * rigid_rms(points.detach(), self.source.truth(q))
+        return 1e3 * rigid_rms(points, self.source.truth(q))
 
     # --- files ----------------------------------------------------------------------------------------------------
 
@@ -230,25 +230,11 @@ def _seen_from(rows: Any, T: Tensor) -> Any:
         return rows
     if rows.corners is not None:
         return rows  # the board stays
-    if rows.poses is None:
-        points = rows.points @ T[:3, :3].mT + T[:3, 3]
-        return with_attributes(rows, points=points)
-    frames = rows.frames if rows.frames.shape[1] > 1 else rows.frames[:, 0]
-    on = None if rows.on is None else rows.on[::3]
-    known: dict[str, Any] = {"camera_on_tool": rows.board is not None, "on": on, "lever": rows.lever}
-    seen = torch.linalg.inv(frames) @ T if rows.board is not None else T @ frames
-    found = dc.Measurements.from_poses(rows.q, seen, rows.joint_names, **known)
-    return found if rows.payload is None else found.with_payload(rows.payload)
-
-
-def rigid_rms(points: Tensor, truth: Tensor) -> float:
-    """RMS distance (N, P, 3) after the best rigid motion of all points, m."""
-    a, b = points.flatten(0, 1), truth.flatten(0, 1)
-    middle, target = a.mean(0), b.mean(0)
-    U, _, Vh = torch.linalg.svd((a - middle).mT @ (b - target))
-    turn = torch.eye(3, dtype=a.dtype)
-    turn[2, 2] = torch.linalg.det(U @ Vh)
-    return float(((a - middle) @ U @ turn @ Vh + target - b).square().sum(-1).mean().sqrt())
+    if rows.board is not None:
+        boards = torch.linalg.inv(rows.frames[:, 0]) @ T
+        return dc.Measurements.from_poses(rows.q, boards, rows.joint_names, camera_on_tool=True, lever=rows.lever)
+    moved = rows.in_frames(T.expand(len(rows), 4, 4))
+    return with_attributes(rows, points=moved.points) if rows.poses is None else moved
 
 
 def of_payload(kind: Kind) -> dc.CalibratedKinematics:
@@ -267,10 +253,6 @@ def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1
     assert kind.error_mm(loaded(q), q) < factor * kind.source.worst_mm
 
 
-def finite(values: torch.Tensor) -> torch.Tensor:
-    return values[values.isfinite()]
-
-
 def check_same_rows(found: Any, rows: Any) -> None:
     """But for the last digits that a table does not hold."""
     assert_close(found.q, rows.q, rtol=0, atol=1e-12)
@@ -279,7 +261,8 @@ def check_same_rows(found: Any, rows: Any) -> None:
     for one, other in zip(found.parts, rows.parts, strict=True):
         for name, values in other.columns.items():
             if name == "corners":  # padding is not written
-                assert_close(finite(one.columns[name]), finite(values), rtol=0, atol=1e-9)
+                ours, theirs = (own[own.isfinite()] for own in (one.columns[name], values))
+                assert_close(ours, theirs, rtol=0, atol=1e-9)
             elif name not in NUMBERED and not (name in FROM_IMAGES and other.corners is not None):
                 assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
 

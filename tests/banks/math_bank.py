@@ -7,6 +7,7 @@ from itertools import pairwise
 from math import log2, sqrt
 
 import torch
+from numbers_bank import drawn, normal, tensor
 from section_5 import SIGMA, section_5, section_5_kernels
 from torch import Tensor
 
@@ -21,10 +22,6 @@ from diffeo_calib.robots import elastic_rr
 Kappa = Callable[[Tensor], Tensor]
 
 
-def tensor(values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Another number of torch's threads inside."""
@@ -36,15 +33,9 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def normal(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
 def uniform(*shape: int, seed: int = 0) -> Tensor:
     """In [-pi, pi)."""
-    return torch.pi * (
-        2.0 * torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 1.0
-    )
+    return torch.pi * (2.0 * drawn(*shape, seed=seed) - 1.0)
 
 
 def line(dim: int = 1) -> Space:

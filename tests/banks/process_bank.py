@@ -9,7 +9,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import torch
-from product_bank import sliding_measurements, sliding_robot
+from product_bank import erring, sliding_robot
 from reading_bank import scales
 from source_bank import SOURCES
 from tangent_bank import normal, shaken
@@ -23,6 +23,7 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.regression.tails import Tails
+from diffeo_calib.robots import SimulatedArm
 
 NARROW_M_RAD = 1e-3
 """Prior deviation of the places: formulas with the whole covariance keep their digits."""
@@ -70,9 +71,10 @@ class Case:
 
 ROWS: dict[str, Callable[[], tuple[dc.Tree, Any]]] = {
     "one marker": lambda: first("positions", 14),
+    "two markers": lambda: (SimulatedArm(3).nominal, dc.Measurements(*SimulatedArm(3, markers=2).measure(14, seed=4))),
     "hidden markers": lambda: first("hidden markers", 12),
     "poses": lambda: first("poses", 10),
-    "sliding": lambda: (sliding_robot(), sliding_measurements(sliding_robot(), 14)),
+    "sliding": lambda: (sliding_robot(), erring(sliding_robot(), 14)),
     "distances": lambda: first("distances", 45),
     "mixture": lambda: first("mixture", 40),
 }

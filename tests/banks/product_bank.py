@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import robot_data
 import torch
+from numbers_bank import drawn, inside, normal, tensor
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -15,8 +16,6 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 TEST_ROWS = 300
-BASE, TIP = "base_link", "flange"
-POSITION = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,7 @@ def simulated(rows: int, **errors: float) -> tuple[SimulatedArm, dc.Measurements
 def covered(model: dc.CalibratedKinematics, data: dc.Measurements) -> float:
     """Share of the markers inside their 95 % regions."""
     mean, covariance = model.predict(data.q)
-    away = (mean - data.points)[..., None]
-    return float(((away.mT @ torch.linalg.solve(covariance, away)) < 7.815).double().mean())
+    return inside(mean - data.points, covariance)
 
 
 USUAL: dict[str, float | tuple[float, ...]] = {
@@ -75,9 +73,8 @@ def scales_of(joints: int, moving: int, **changed: float | tuple[float, ...]) ->
     """Usual scales of a robot, some of them changed."""
 
     def sized(name: str, value: float | tuple[float, ...]) -> Tensor:
-        found = torch.tensor(value, dtype=torch.float64)
         count = moving if name.endswith("compliance") else joints
-        return found if name in ONE or found.ndim else found.repeat(count)
+        return tensor(value) if name in ONE or isinstance(value, tuple) else tensor(value).repeat(count)
 
     return dc.Hyperparameters(**{name: sized(name, value) for name, value in {**USUAL, **changed}.items()})
 
@@ -133,10 +130,8 @@ def calibrated_poses(rows: int) -> Case:
 
 def ur10_measurements(folder: Path) -> tuple[dc.Chain, dc.Measurements]:
     """The UR10 and its 632 rows."""
-    robot = dc.load_urdf(folder / "ur10_robot.urdf", base="base_link", tip="ee_link")
-    columns = [f"measurement_{axis}" for axis in POSITION]
-    csv = folder / "measurements_iso_cubes.csv"
-    return robot, dc.read_measurements(csv, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
+    found = robot_data.read(folder, robot_data.BUILT_IN["ipa_ur10"])
+    return found.robot, found.measurements
 
 
 def sliding_robot() -> dc.Chain:
@@ -153,25 +148,16 @@ def sliding_robot() -> dc.Chain:
     return dc.from_dh(rows, names=["pan", "tilt", "slide", "roll", "bend", "turn"], name="slider")
 
 
-def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measurements:
-    """Geometric errors, and a spindle whose pitch error has a period of 0.3 m."""
-    rng = np.random.default_rng(seed)
-    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.05, 0.02, 0.1]], dtype=torch.float64))
-    theta = 5e-4 * np.random.default_rng(7).standard_normal(truth.size)
-    theta[:6] = (1.0, 2.0, 0.5, 0.3, 0.2, 0.1)
-    q = torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
-    pan, tilt, slide, roll, bend, turn = q.unbind(1)
-    error = [
-        3e-4 * (pan + 1).sin(),
-        2e-4 * tilt.cos(),
-        4e-4 * (2 * math.pi / 0.3 * slide).sin(),
-        2e-4 * (2 * roll).sin(),
-        1e-4 * bend.cos(),
-        0 * turn,
-    ]
-    points = truth.absorb(torch.from_numpy(theta)).points(q + torch.stack(error, 1))
-    noise = 1e-5 * rng.standard_normal(tuple(points.shape))
-    return dc.Measurements(q, points + torch.from_numpy(noise), robot.joint_names)
+def erring(robot: dc.Tree, rows: int, seed: int = 0, noise: float = 1e-5) -> dc.Measurements:
+    """Of any robot: geometric errors; two waves per turn of every joint, or a spindle's with a period of 0.3 m."""
+    truth = replace(Geometry.nominal(robot), tool=tensor([[0.05, 0.02, 0.1]]))
+    theta = normal(truth.size, seed=7, size=5e-4)
+    theta[:6] = tensor([1.0, 2.0, 0.5, 0.3, 0.2, 0.1])
+    turning = torch.tensor(robot.periodic)
+    q = torch.where(turning, 4.0 * drawn(rows, robot.n, seed=seed) - 2.0, 0.6 * drawn(rows, robot.n, seed=seed))
+    waves = (torch.where(turning, 2.0, 2 * math.pi / 0.3) * q + torch.arange(robot.n)).sin()
+    points = truth.absorb(theta).points(q + torch.where(turning, 2e-4, 4e-4) * waves)
+    return dc.Measurements(q, points + normal(*points.shape, seed=seed, size=noise), robot.joint_names)
 
 
 def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:

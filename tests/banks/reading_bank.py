@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from product_bank import scales_of
-from tangent_bank import normal
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -50,15 +50,16 @@ def readings(
     turned: Callable[[Tensor], Tensor] = lambda q: q,
 ) -> dc.Readings:
     q, which = arm.sample(rows, seed), torch.arange(rows) % 3
-    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=seed + 2)
+    names, draws = [f"device {number}" for number in which.tolist()], np.random.default_rng(seed + 2)
     z, joints = in_base(arm, turned(q), payload), arm.nominal.joint_names
     if kind == "image":
-        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=seed + 2)
+        seen = pixels(z, which) + noise * 1200 * torch.from_numpy(draws.standard_normal((rows, 2)))
         return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)
+    errors = noise * torch.from_numpy(draws.standard_normal(rows))
     if kind == "distance":
-        lengths = (z - POINTS[which]).norm(dim=1) + zero + draws
+        lengths = (z - POINTS[which]).norm(dim=1) + zero + errors
         return dc.Readings.distances(q, lengths, names, joints, offset_std=0.1 if zero else 0.0)
-    return dc.Readings.heights(q, (z * AXES[which]).sum(1) - 0.3 + draws, names, joints)
+    return dc.Readings.heights(q, (z * AXES[which]).sum(1) - 0.3 + errors, names, joints)
 
 
 def scales() -> dc.Hyperparameters:

@@ -6,15 +6,11 @@ from math import inf, pi
 
 import pytest
 import torch
+from numbers_bank import normal as draw
 from torch import Tensor
 
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, from_dh
 from diffeo_calib.robots.se3 import rotation, twist_transform
-
-
-def draw(*shape: int, seed: int = 0, size: float = 1.0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return size * torch.randn(*shape, dtype=torch.float64, device="cpu", generator=generator)
 
 
 def tool_frame() -> Tensor:
@@ -35,6 +31,14 @@ def crooked(kinds: list[str], mimic: dict[int, dict[str, float]] | None = None) 
     for k, multipliers in (mimic or {}).items():
         joints[k] = replace(joints[k], mimic=multipliers, mimic_offset=0.2)
     return Chain("crooked", "floor", "hand", joints)
+
+
+def limited(*limits: tuple[str, float, float]) -> Chain:
+    """Joints j0, j1, ... (kind, lower, upper) about z, 0.3 m from each other."""
+    origin = torch.eye(4, dtype=torch.float64)
+    origin[0, 3] = 0.3
+    joints = [Joint(f"j{k}", kind, origin, lower=low, upper=high) for k, (kind, low, high) in enumerate(limits)]
+    return Chain("limited", "base", "tip", joints)
 
 
 def parallelogram() -> Chain:

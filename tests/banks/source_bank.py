@@ -14,6 +14,7 @@ import numpy as np
 import reading_bank
 import torch
 import two_arms_bank
+from numbers_bank import normal, tensor
 from product_bank import simulated_poses, usual_scales
 from reading_bank import DISTANCES
 from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
@@ -103,7 +104,7 @@ def _tips() -> Source:
     return Source(robot, rows, usual_scales(robot), truth, 0.2)
 
 
-MOVED = twist_transform(torch.tensor([5e-3, 2e-3, -4e-3, 1e-3, -2e-3, 0.5e-3], dtype=torch.float64))
+MOVED = twist_transform(tensor([5e-3, 2e-3, -4e-3, 1e-3, -2e-3, 0.5e-3]))
 """From the frame of the larger session to that of the other one."""
 
 
@@ -118,7 +119,7 @@ def _sessions(rows: int, *, wrong: bool = False) -> Source:
     return of_arm(arm, dc.Measurements(q, points, arm.nominal.joint_names).with_sessions(names), 0.25, (0, 1))
 
 
-MOUNTED = torch.tensor([[0.0, 0.0, 0.0], [3e-3, -4e-3, 0.0], [-2e-3, 1e-3, 4.5e-3]], dtype=torch.float64)
+MOUNTED = tensor([[0.0, 0.0, 0.0], [3e-3, -4e-3, 0.0], [-2e-3, 1e-3, 4.5e-3]])
 """Places of the marker in three sessions, from that of the first, in the frame of the tip, m."""
 
 
@@ -136,11 +137,15 @@ def _remounted() -> Source:
     return of_arm(arm, remounted(arm, tracked(arm, 96, 2)), 0.2)
 
 
+def laden(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    """Under payloads that change from row to row."""
+    masses = torch.from_numpy(np.random.default_rng(0).choice([0.0, 4.0, 10.0], rows))
+    return dc.Measurements(*arm.measure(rows, seed=seed, payload=masses)).with_payload(masses)
+
+
 def _payloads() -> Source:
     arm = SimulatedArm(seed=1)
-    masses = torch.from_numpy(np.random.default_rng(0).choice([0.0, 4.0, 10.0], 56))
-    q, points = arm.measure(56, seed=1, payload=masses)
-    return of_arm(arm, dc.Measurements(q, points).with_payload(masses), 0.25, mass=4.0, payload=1.5)
+    return of_arm(arm, laden(arm, 56, 1), 0.25, mass=4.0, payload=1.5)
 
 
 def _sockets() -> Source:
@@ -150,9 +155,9 @@ def _sockets() -> Source:
 
 def _mixture() -> Source:
     """The ball is marker 0; a tracker sees marker 1."""
-    arm, noise = SimulatedArm(seed=3, markers=2), torch.tensor(2e-5, dtype=torch.float64)
+    arm = SimulatedArm(seed=3, markers=2)
     rows = dc.Measurements.joined([tracked(arm, 25, 5, 1), resting(arm, places=3, rows=5)])
-    return of_arm(arm, rows, 0.5, (1, 0), other_noise=noise)
+    return of_arm(arm, rows, 0.5, (1, 0), other_noise=tensor(2e-5))
 
 
 def _readings(kind: str, worst_mm: float, zero: float = 0.0) -> Source:
@@ -175,7 +180,7 @@ def _images(*, tracker: bool = False) -> Source:
         arm = copy.copy(seen.arm)
         arm.truth = replace(arm.truth, base=other.truth.base, tool=other.truth.tool, on=other.truth.on)
         q = arm.sample(40, seed=3)
-        noise = 2e-5 * torch.randn(40, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+        noise = normal(40, 1, 3, seed=3, size=2e-5)
         points = dc.Measurements(q, arm.true_points(q) + noise, arm.nominal.joint_names)
         rows = dc.Observations.joined([rows, points])  # pyright: ignore
     return of_arm(seen.arm, rows, 0.3, (0, 1, 2))

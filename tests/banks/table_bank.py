@@ -34,11 +34,6 @@ def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements
     return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
 
 
-def values(*shape: int, seed: int = 0) -> Tensor:
-    """Normal random numbers."""
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator("cpu").manual_seed(seed))
-
-
 def read_table(path: Path, joints: Any, position: Any, table: TableFormat, **how: Any) -> Measurements:
     """Positions or poses in a format; options are those of the columns, and duplicates."""
     duplicates = how.pop("duplicates", "error")

@@ -4,9 +4,9 @@ from dataclasses import replace
 from functools import cache
 from math import pi
 
-import numpy as np
 import torch
-from product_bank import joint_covariance, simulated_poses, sliding_measurements, sliding_robot
+from numbers_bank import drawn, normal, tensor
+from product_bank import erring, joint_covariance, simulated_poses, sliding_robot
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -18,7 +18,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.regression.tails import Tails
-from diffeo_calib.robots import DHRow, Geometry, SimulatedArm
+from diffeo_calib.robots import DHRow, SimulatedArm
 from diffeo_calib.robots.tree import Tree
 
 
@@ -48,7 +48,7 @@ def two_markers() -> Setting:
 
 
 def sliding() -> Setting:
-    return Setting(sliding_robot(), sliding_measurements(sliding_robot(), 25))
+    return Setting(sliding_robot(), erring(sliding_robot(), 25))
 
 
 def posed() -> Setting:
@@ -69,13 +69,7 @@ def mimicking() -> Setting:
         DHRow(0.0, 0.0, -0.1),
     ]
     robot = dc.from_dh(rows, name="palletizer")
-    rng = np.random.default_rng(3)
-    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.06, 0.03, 0.1]], dtype=torch.float64))
-    theta = torch.from_numpy(5e-4 * rng.standard_normal(truth.size))
-    q = torch.from_numpy(rng.uniform(-1.5, 1.5, (24, robot.n)))
-    error = torch.stack([2e-4 * (q[:, k] * (k + 1)).sin() for k in range(robot.n)], 1)
-    points = truth.points(q + error, theta) + torch.from_numpy(1e-5 * rng.standard_normal((24, 1, 3)))
-    return Setting(robot, dc.Measurements(q, points))
+    return Setting(robot, erring(robot, 24))
 
 
 SETTINGS = {"two markers": two_markers, "sliding": sliding, "posed": posed, "mimic joint": mimicking}
@@ -87,10 +81,6 @@ def built(name: str) -> Setting:
     return SETTINGS[name]()
 
 
-def normal(*shape: int, seed: int) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).standard_normal(shape))
-
-
 def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyperparameters:
     """Other scales nearby."""
     vector = scales.logarithms()
@@ -100,10 +90,9 @@ def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyper
 def weighted(setting: Setting, seed: int = 0) -> TangentData:
     """The same measurements with weights of any size, and a nominal map that sags under gravity."""
     data = setting.tangent_data
-    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape)))
+    weights = 0.05 + 1.45 * drawn(*data.tails.weights.shape, seed=seed)
     theta = data.theta.clone()
-    coefficients = slice(data.nominal.geometry.size, None)
-    theta[coefficients] = 1e-3 * normal(len(theta[coefficients]), seed=seed)
+    theta[data.nominal.geometry.size :] = normal(len(theta) - data.nominal.geometry.size, seed=seed, size=1e-3)
     return replace(data, theta=theta, tails=Tails(4.0, weights))
 
 
@@ -121,8 +110,7 @@ def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
 
 def places(chain: Tree) -> list[int]:
     """Frames (the tip's last) that are not always in the point where the frame before is."""
-    q = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (9, chain.n)))
-    origins = _origins(chain, q)
+    origins = _origins(chain, 2 * drawn(9, chain.n) - 1)
     steps = (origins[:, 1:] - origins[:, :-1]).norm(dim=-1).amax(0)
     return [k + 1 for k, step in enumerate(steps.tolist()) if step > 1e-6]
 
@@ -149,23 +137,20 @@ def gravity_covariance(scales: dc.Hyperparameters, nominal: GeometryMap, theta: 
 
     def add(effect: Tensor, feature: Tensor, deviation: Tensor) -> None:
         nonlocal total
-        for component in range(3):
-            column = (deviation * scales.gravity[component] * effect * feature[:, component, None]).flatten()
-            total = total + torch.outer(column, column)
+        columns = (deviation * scales.gravity * effect[..., None] * feature[:, None]).flatten(0, 1)
+        total = total + columns @ columns.mT
 
     for joint, axis in enumerate(chain.axes):
-        turning = bool(chain.revolute[joint])
+        turning, R = bool(chain.revolute[joint]), frames[:, joint, :3, :3]
         if not turning:
-            force = frames[:, joint, :3, :3] @ axis
-            add(twists[:, :, joint, :3] @ axis, force, scales.compliance[joint])
+            add(twists[:, :, joint, :3] @ axis, R @ axis, scales.compliance[joint])
         for number, turn in enumerate(_turns(axis)):
             own = turning and number == 0
             deviation = (scales.compliance if own else scales.lateral_compliance)[joint]
-            e = frames[:, joint, :3, :3] @ turn
             for place in places(chain):
                 if place > joint:
                     arm = origins[:, place] - origins[:, joint]
-                    add(twists[:, :, joint, 3:] @ turn, torch.linalg.cross(e, arm), deviation)
+                    add(twists[:, :, joint, 3:] @ turn, torch.linalg.cross(R @ turn, arm), deviation)
     return total
 
 
@@ -181,7 +166,7 @@ def tangent_covariance(scales: dc.Hyperparameters, nominal: GeometryMap, theta: 
                 G[:, 3 * k + axis, :, 3 * h + axis] += scales.task_amplitude**2 * (-r2 / 2).exp()
     shift, turn = float(scales.translation_errors), float(scales.rotation_errors)
     each = [0.1] * 6 + ([shift] * 3 + [turn] * 3) * geometry.chain.moving + [0.1] * 3 * geometry.markers
-    S = nominal.sensitivities(x, theta)[..., : geometry.size].flatten(0, 1) * torch.tensor(each, dtype=torch.float64)
+    S = nominal.sensitivities(x, theta)[..., : geometry.size].flatten(0, 1) * tensor(each)
     return G.reshape(len(S), len(S)) + S @ S.mT + gravity_covariance(scales, nominal, theta, x)
 
 
@@ -215,18 +200,13 @@ def noise_covariance(scales: dc.Hyperparameters, setting: Setting, theta: Tensor
 def body_modes(poses: Tensor, lever: float, h: float = 1e-4) -> Tensor:
     """What shifts and turns of a pose do to its points, by central differences: (N, 9, 6)."""
     columns = []
-    for k in range(6):
+    for step in torch.eye(6, dtype=torch.float64):
         ends = []
-        for sign in (1, -1):
+        for d in (h * step, -h * step):
+            x, y, z = d[3:].tolist()
+            turn = torch.linalg.matrix_exp(tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
             moved = poses.clone()
-            if k < 3:
-                moved[:, k, 3] += sign * h
-            else:
-                vector = torch.zeros(3, dtype=torch.float64)
-                vector[k - 3] = sign * h
-                x, y, z = vector.tolist()
-                skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-                moved[:, :3, :3] = torch.linalg.matrix_exp(skew) @ moved[:, :3, :3]
+            moved[:, :3] = torch.cat([turn @ poses[:, :3, :3], poses[:, :3, 3:] + d[:3, None]], 2)
             ends.append(mark_points(moved, lever).flatten(1))
         columns.append((ends[0] - ends[1]) / (2 * h))
     return torch.stack(columns, 2)

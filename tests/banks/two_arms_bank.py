@@ -1,5 +1,6 @@
 """A small robot with two arms on one waist, five joints, and measured poses of both hands."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,22 +19,20 @@ JOINTS = (
     ("right_shoulder", "torso", "right_arm", "0 -0.2 0.3", "0 1 0"),
     ("right_wrist", "right_arm", "right_forearm", "0.3 0 0", "1 0 0"),
 )
-LINKS = ("base", "torso", "left_arm", "left_forearm", "right_arm", "right_forearm", *HANDS)
+"""Name, parent, child, origin and axis."""
+Joints = Sequence[tuple[str, str, str, str, str]]
 
 
-def urdf() -> str:
-    links = "".join(f'<link name="{name}"/>' for name in LINKS)
-    joints = "".join(
-        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{xyz}"/><axis xyz="{axis}"/><limit lower="-1.4" upper="1.4"/></joint>'
-        for name, parent, child, xyz, axis in JOINTS
-    )
-    hands = "".join(
-        f'<joint name="{side}_end" type="fixed"><parent link="{side}_forearm"/><child link="{side}"/>'
-        '<origin xyz="0.2 0 0.05"/></joint>'
-        for side in HANDS
-    )
-    return f'<robot name="two_arms">{links}{joints}{hands}</robot>'
+def urdf(joints: Joints = JOINTS, end: str = "0.2 0 0.05", limit: float = 1.4) -> str:
+    """Arms whose joints begin with the names of their hands, each of them fixed to the last link."""
+    last = {side: [child for name, _, child, *_ in joints if name.startswith(side)][-1] for side in HANDS}
+    whole = [*joints, *((f"{side}_end", last[side], side, end, "") for side in HANDS)]
+    text = "".join(f'<link name="{name}"/>' for name in dict.fromkeys(link for own in whole for link in own[1:3]))
+    for name, parent, child, xyz, axis in whole:
+        text += f'<joint name="{name}" type="{"revolute" if axis else "fixed"}"><parent link="{parent}"/>'
+        text += f'<child link="{child}"/><origin xyz="{xyz}"/>'
+        text += f'<axis xyz="{axis}"/><limit lower="-{limit}" upper="{limit}"/></joint>' if axis else "</joint>"
+    return f'<robot name="two_arms">{text}</robot>'
 
 
 def robot(folder: Path) -> dc.Tree:
@@ -62,12 +61,16 @@ class TwoArms:
         """True poses of the measured frames (N, 2, 4, 4), m."""
         return self.truth.marker_poses(q + self.amplitudes * torch.sin(2 * q)) @ self.frames
 
+    def noisy(self, q: Tensor) -> Tensor:
+        """Measured poses."""
+        poses = self.poses(q)
+        turned = rotation(10 * self.noise * self.drawn(len(q), 2, 3)) @ poses[..., :3, :3]
+        return transforms(turned, poses[..., :3, 3] + self.noise * self.drawn(len(q), 2, 3))
+
     def measured(self, rows: int, hidden: int = 0) -> dc.Measurements:
         """Noisy poses, some of which are hidden."""
         q = torch.from_numpy(self.rng.uniform(-1.3, 1.3, (rows, self.nominal.n)))
-        poses = self.poses(q)
-        turned = rotation(10 * self.noise * self.drawn(rows, 2, 3)) @ poses[..., :3, :3]
-        poses = transforms(turned, poses[..., :3, 3] + self.noise * self.drawn(rows, 2, 3))
+        poses = self.noisy(q)
         for row in range(hidden):
             poses[2 * row, row % 2] = torch.nan
         return dc.Measurements.from_poses(q, poses, self.nominal.joint_names, on=HANDS)

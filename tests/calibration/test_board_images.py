@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import kind_named
+from numbers_bank import normal, tensor
 from simulated_camera import BOARD_PRIOR, HEIGHT, LENS, WIDTH, CameraArm, camera_arm, true_camera
 from simulated_sockets import rest_in_sockets
 from table_bank import refused, says, warned
@@ -21,8 +22,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.board import BoardPrior
-from diffeo_calib.cameras.images import UNKNOWNS
-from diffeo_calib.common.device import seeded
+from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
@@ -34,42 +34,44 @@ from diffeo_calib.robots.se3 import twist_transform
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 
-@cache
-def arm() -> CameraArm:
-    return camera_arm(60)
+SCALE = UNKNOWNS.index("scale")
+SEEN, TRUE = camera_arm(60), true_camera()
+ARM = SEEN.arm.nominal
 
 
 def data() -> dc.Measurements:
     return kind_named("images of a board").data
 
 
-def calibrated() -> Any:
-    return kind_named("images of a board").result
+def calibrated(name: str = "images of a board") -> Any:
+    return kind_named(name).result
+
+
+def camera(result: Any) -> Camera:
+    return next(own for own in result.model.placement if own.cameras).cameras["camera"].camera
 
 
 def of_corners(corners: Tensor, q: Tensor | None = None, **known: Any) -> dc.Measurements:
     q = data().q if q is None else q
     known = {"board": BoardPrior(scale=2e-4), "camera": (WIDTH, HEIGHT), **known}
-    return dc.Measurements.from_images(q, corners, joint_names=arm().arm.nominal.joint_names, **known)
+    return dc.Measurements.from_images(q, corners, joint_names=ARM.joint_names, **known)
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    camera = calibrated().model.placement[0].cameras["camera"].camera
-    truth, deviations = true_camera().unknowns, camera.deviations
-    assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
-    before = data().camera
-    assert bool((deviations <= 1.001 * before.deviations).all())  # rows of the robot can only add
-    assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
+    found, before = camera(calibrated()), data().camera
+    assert float(((found.unknowns - TRUE.unknowns) / found.deviations).abs().max()) < 4.5
+    assert bool((found.deviations <= 1.001 * before.deviations).all())  # rows of the robot can only add
+    assert float(found.deviations[SCALE]) < 0.999 * float(before.deviations[SCALE])
 
 
 def test_a_model_is_compared_with_what_its_own_camera_sees() -> None:
     """Images alone put a board that is larger than was said nearer than it is: no error of the robot."""
-    unknowns = true_camera().unknowns.clone()
-    unknowns[UNKNOWNS.index("scale")] = 2e-3
-    q, corners = replace(arm(), camera=replace(true_camera(), unknowns=unknowns)).shown(0.1, 11)
+    unknowns = TRUE.unknowns.clone()
+    unknowns[SCALE] = 2e-3
+    q, corners = replace(SEEN, camera=replace(TRUE, unknowns=unknowns)).shown(0.1, 11)
     images = of_corners(corners, q, board=BoardPrior(scale=5e-3))
-    result = dc.calibrate(arm().arm.nominal, images, hyperparameters=calibrated().selection.scales)
-    cameras = {"camera": result.model.placement[0].cameras["camera"].camera}
+    result = dc.calibrate(ARM, images, hyperparameters=calibrated().selection.scales)
+    cameras = {"camera": camera(result)}
     once = images.seen_with(cameras)
     assert_close(once.seen_with(cameras).points, once.points, rtol=0, atol=1e-12)
     errors = next(iter(result.errors(images).values()))
@@ -79,28 +81,25 @@ def test_a_model_is_compared_with_what_its_own_camera_sees() -> None:
 
 
 def test_what_a_model_knows_of_the_lens_counts_until_it_changes() -> None:
-    known, count, truth = calibrated().model.placement[0].cameras["camera"].camera, 20, true_camera()
-    q, corners = arm().shown(0.1, 11)
+    known, count, focused = camera(calibrated()), 20, TRUE.unknowns.clone()
+    q, corners = SEEN.shown(0.1, 11)
     new = of_corners(corners[:count], q[:count])
     again = new.with_earlier({"camera": known})
     assert bool((again.camera.deviations <= 1.001 * known.deviations).all())
-    assert float(((again.camera.unknowns - truth.unknowns) / again.camera.deviations).abs().max()) < 4.5
-    before, after = ((each.points - arm().arm.true_points(each.q)).square().mean().sqrt() for each in (new, again))
-    assert float(after) < 0.85 * float(before)
+    assert float(((again.camera.unknowns - TRUE.unknowns) / again.camera.deviations).abs().max()) < 4.5
+    before, after = (float((each.points - SEEN.arm.true_points(each.q)).norm()) for each in (new, again))
+    assert after < 0.85 * before
     assert again.sha256 == new.sha256
-    focused = truth.unknowns.clone()
     focused[:2] *= 1.005
-    q, corners = replace(arm(), camera=replace(truth, unknowns=focused)).shown(0.1, 11)
+    q, corners = replace(SEEN, camera=replace(TRUE, unknowns=focused)).shown(0.1, 11)
     other = of_corners(corners[:count], q[:count])
     assert other.with_earlier({"camera": known}) is other
     assert new.with_earlier({"left": known}) is new
 
 
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
-    corners: Any = data().corners
-    wrong = corners.clone()
-    wrong[..., :3] *= 0.988
-    found, texts = warned(place, arm().arm.nominal, of_corners(wrong), silent)
+    wrong = data().corners * tensor([0.988] * 3 + [1.0] * 2)
+    found, texts = warned(place, ARM, of_corners(wrong), silent)
     assert any("size of the board" in one for one in texts)
     assert any(line.startswith("not decided: lengths that differ by 1.") for line in found.placement.sentences())
     assert not any(line.startswith("not decided") for line in calibrated().placement.sentences())
@@ -108,9 +107,9 @@ def test_a_board_of_nearly_the_right_size_is_named() -> None:
 
 def test_tables_that_cannot_be() -> None:
     corners: Any = data().corners
-    small = replace(true_camera(), half_size=0.0, width=640, height=480)
+    small = replace(TRUE, half_size=0.0, width=640, height=480)
     refused(
-        ("row", lambda: dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))),
+        ("row", lambda: dc.calibrate(ARM, of_corners(corners.roll(1, 0)))),
         ("640 x 480", lambda: of_corners(corners, camera=small)),
         ("640 x 480", lambda: dc.Measurements.from_images(data().q, corners, (640, 480))),
         (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(45, 35))),
@@ -124,13 +123,11 @@ def test_joints_that_still_moved_are_warned_about() -> None:
     q[1:] = 0.9 * data().q[1:] + 0.1 * data().q[:-1]
     corners: Any = data().corners
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit this robot"):
-        place(arm().arm.nominal, of_corners(corners, q), silent)
+        place(ARM, of_corners(corners, q), silent)
 
 
 def test_the_lens_of_another_camera_is_refused() -> None:
-    corners, camera = data().corners, true_camera()
-    other = camera.unknowns.clone()
-    known = replace(camera, half_size=0.0)
+    corners, other, known = data().corners, TRUE.unknowns.clone(), replace(TRUE, half_size=0.0)
     of_corners(corners, camera=known)
     other[:2] *= 1.05
     with pytest.warns(dc.DiffeoCalibWarning, match=r"given camera does not quite fit.*1260"):
@@ -154,40 +151,29 @@ def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
 # --- beside a tracker, and beside a ball in sockets -------------------------------------------------------------------
 
 
-SCALE = UNKNOWNS.index("scale")
-
-
-def kind() -> Any:
-    return kind_named("images and a tracker")
-
-
-def camera() -> Any:
-    return next(iter(next(own for own in kind().model.placement if own.cameras).cameras.values())).camera
+BESIDE = "images and a tracker"
 
 
 @cache
-def with_sockets() -> tuple[Any, Any]:
-    """Images, then rows in sockets, and the socket of every such row."""
-    seen, ball = camera_arm(60), SimulatedArm(seed=1)
-    arm = copy.copy(seen.arm)
-    arm.truth = replace(arm.truth, base=torch.eye(4, dtype=torch.float64), tool=ball.truth.tool, on=ball.truth.on)
-    resting = rest_in_sockets(arm, places=2, rows=10)
-    rows = dc.Measurements.from_sockets(resting.q, resting.names, arm.nominal.joint_names)
-    return seen, dc.Observations.joined([seen.images(0.1), rows])  # pyright: ignore
+def in_sockets() -> Any:
+    """Rows of a ball in sockets, of the same arm."""
+    ball, arm = SimulatedArm(seed=1).truth, copy.copy(SEEN.arm)
+    arm.truth = replace(arm.truth, base=torch.eye(4, dtype=torch.float64), tool=ball.tool, on=ball.on)
+    return rest_in_sockets(arm, places=2, rows=10)
 
 
 def test_the_size_comes_from_board_and_tracker() -> None:
-    truth, own = camera_arm(60).camera, camera()
+    own = camera(calibrated(BESIDE))
     assert float(own.deviations[SCALE]) < 0.4 * BOARD_PRIOR.scale
-    assert abs(float(own.unknowns[SCALE] - truth.unknowns[SCALE])) < 4 * float(own.deviations[SCALE])
-    said = " ".join(kind().result.placement.sentences())
-    assert "lengths are its own and the board's" in said
+    assert abs(float(own.unknowns[SCALE] - TRUE.unknowns[SCALE])) < 4 * float(own.deviations[SCALE])
+    assert "lengths are its own and the board's" in " ".join(calibrated(BESIDE).placement.sentences())
 
 
 @pytest.mark.slow
 def test_sockets_are_where_they_are() -> None:
-    rows = with_sockets()[1]
-    found = dc.calibrate(kind().robot, rows, hyperparameters=kind().scales)
+    resting = dc.Measurements.from_sockets(in_sockets().q, in_sockets().names, ARM.joint_names)
+    rows: Any = dc.Observations.joined([SEEN.images(0.1), resting])  # pyright: ignore
+    found = dc.calibrate(ARM, rows, hyperparameters=kind_named(BESIDE).scales)
     placed = next(own for own in found.model.placement if own.kind == "contact")
     assert placed.names == ("0/0", "0/1", "1/0", "1/1")
     places, std = placed.constants[:, :3], placed.deviations[:, :3].norm(dim=1)
@@ -198,61 +184,52 @@ def test_sockets_are_where_they_are() -> None:
 
 
 def test_known_distances_that_are_not_used_are_named() -> None:
-    rows = with_sockets()[1]
-    resting = dc.Measurements.from_sockets(
-        rows.parts[1].q, rows.parts[1].device_names, distances={("0", "1"): 0.05}, distance_std=1e-5
-    )
-    images: Any = camera_arm(60).images(0.1)
+    known: Any = {"distances": {("0", "1"): 0.05}, "distance_std": 1e-5}
+    resting = dc.Measurements.from_sockets(in_sockets().q, in_sockets().names, ARM.joint_names, **known)
     with pytest.warns(dc.DiffeoCalibWarning, match="distances between sockets"):
-        dc.Observations.joined([images.with_joint_names(rows.joint_names), resting.with_joint_names(rows.joint_names)])
+        dc.Observations.joined([SEEN.images(0.1), resting])
 
 
 IMAGES, NOISE_PX = 40, 0.1
-ARM = camera_arm(IMAGES, 2)
+FEWER = camera_arm(IMAGES, 2)
 
 
 def focusing(arm: CameraArm, focus: float = 0.0) -> tuple[dc.CalibrationResult, list[str]]:
     """With a focal length of each image that differs by this share, and the warnings."""
     q, corners = arm.shown(NOISE_PX, 2)
-    own = 1.0 + focus * torch.randn(len(q), 1, 1, dtype=q.dtype, generator=seeded(1))
-    middle = torch.tensor(LENS[2:4], dtype=q.dtype)
-    pixels = middle + own * (corners[..., 3:] - middle)
-    outside = (pixels < 0).any(2) | (pixels > torch.tensor([WIDTH - 1, HEIGHT - 1])).any(2)
+    middle = tensor(LENS[2:4])
+    pixels = middle + (1.0 + focus * normal(len(q), 1, 1, seed=1)) * (corners[..., 3:] - middle)
+    outside = (pixels < 0).any(2) | (pixels > tensor([WIDTH - 1, HEIGHT - 1])).any(2)
     corners = torch.cat([corners[..., :3], pixels], 2).masked_fill(outside[..., None], torch.nan)
     data = dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), arm.arm.nominal.joint_names, board=BOARD_PRIOR)
     data = data.with_columns(image_names={row: f"{row}.png" for row in range(len(data))}, file_sha256="of a table")
     return warned(dc.calibrate, arm.arm.nominal, data)
 
 
-def error(result: dc.CalibrationResult) -> float:
-    return ARM.error(result.model, ARM.arm.sample(200, seed=9))
-
-
 def test_a_camera_that_focuses_is_no_error_of_the_arm() -> None:
-    (clean, nothing), (moving, said) = focusing(ARM), focusing(ARM, 0.004)
+    (clean, nothing), (moving, said) = focusing(FEWER), focusing(FEWER, 0.004)
     assert not nothing
     assert len(said) == 1
     assert "the focal length of the images seems to differ" in said[0]
     assert "lock focus" in said[0]
     assert "got about 0.34 %, which moves the tool by 1.4 mm" in said[0]  # of 0.35 % drawn, 0.4 m away
     # with this noise in all directions the error was twice as large
-    assert error(moving) < 1.3 * error(clean)
+    assert FEWER.error(moving.model, q := FEWER.arm.sample(200, seed=9)) < 1.3 * FEWER.error(clean.model, q)
     arm = [next(iter(one.placement.entry().values()))["explained_m"] for one in (clean, moving)]  # type: ignore[index]
     assert arm[1]["corners"] > 2.0 * arm[0]["corners"]
 
 
 @pytest.mark.slow
 def test_a_camera_that_slips_on_its_mount_is_named() -> None:
-    slipped = ARM.boards.clone()
-    twist = 5e-4 * torch.tensor([[1.0, 0.0, 0.0, 3.0, 0.0, 0.0]], dtype=torch.float64)
-    slipped[IMAGES // 2 :] = twist_transform(twist) @ slipped[IMAGES // 2 :]
-    _, said = focusing(replace(ARM, boards=slipped))
+    slipped = FEWER.boards.clone()
+    slipped[IMAGES // 2 :] = twist_transform(5e-4 * tensor([1.0, 0.0, 0.0, 3.0, 0.0, 0.0])) @ slipped[IMAGES // 2 :]
+    _, said = focusing(replace(FEWER, boards=slipped))
     assert len(said) == 1
     assert re.search(r"camera on the tool seems to have moved by about .* near row (\d+) \(\1.png\)", said[0])
 
 
 def test_rows_of_a_table_of_corners_are_named_by_their_images(tmp_path: Path) -> None:
-    q, corners = ARM.shown(NOISE_PX, 2)
+    q, corners = FEWER.shown(NOISE_PX, 2)
     lines = ["a,b,c,d,e,f,image,board_x,board_y,u,v"]
     for row, (angles, seen) in enumerate(zip(q.tolist(), corners, strict=True)):
         shown = seen[~seen.isnan().any(1)][:, [0, 1, 3, 4]].tolist()

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numbers_bank import tensor
 from product_bank import sliding_robot
+from robots_bank import limited
 from table_bank import refused
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.candidates import collision_free
-from diffeo_calib.robots import Chain, Joint, SimulatedArm
+from diffeo_calib.robots import Chain, SimulatedArm
 
 
 @pytest.fixture(scope="module")
@@ -25,27 +26,14 @@ def robot() -> Chain:
     return SimulatedArm(seed=1).nominal
 
 
-def chain(*limits: tuple[str, float, float]) -> Chain:
-    origin = torch.eye(4, dtype=torch.float64)
-    origin[0, 3] = 0.3
-    joints = [Joint(f"j{k}", kind, origin, lower=low, upper=high) for k, (kind, low, high) in enumerate(limits)]
-    return Chain("test", "base", "tip", joints)
-
-
 def test_joints_stay_within_their_limits_and_one_turn() -> None:
-    inf = math.inf
-    robot = chain(
-        ("revolute", -1.0, 2.0),
-        ("revolute", -6.5, 6.5),
-        ("continuous", -inf, inf),
-        ("revolute", 1.0, 9.0),
-        ("revolute", -9.0, -1.0),
-        ("prismatic", 0.1, 0.4),
-    )
+    inf, pi = math.inf, math.pi
+    limits = [(-1.0, 2.0), (-6.5, 6.5), (-inf, inf), (1.0, 9.0), (-9.0, -1.0), (0.1, 0.4)]
+    kinds = ["revolute", "revolute", "continuous", "revolute", "revolute", "prismatic"]
+    robot = limited(*((kind, *ends) for kind, ends in zip(kinds, limits, strict=True)))
     q = dc.candidates(robot, 4000)
-    pi = math.pi
     ends = [(-1.0, 2.0), (-pi, pi), (-pi, pi), (1.0, 1.0 + 2 * pi), (-1.0 - 2 * pi, -1.0), (0.1, 0.4)]
-    lower, upper = torch.tensor(ends, dtype=torch.float64).unbind(1)
+    lower, upper = tensor(ends).unbind(1)
     assert q.shape == (4000, 6)
     assert bool(((q >= lower) & (q <= upper)).all())
     near = 0.01 * (upper - lower)  # uniform: 4000 draws come near both ends
@@ -57,26 +45,21 @@ def test_joints_stay_within_their_limits_and_one_turn() -> None:
 def test_the_device_sees_the_marker(robot: Chain) -> None:
     position, marker, direction = np.array([2.0, 1.0, 0.5]), np.array([0.05, 0.0, 0.1]), np.array([0.0, 3.0, 4.0])
     tracker = dc.Tracker(position.tolist(), marker.tolist(), direction.tolist(), half_angle=math.radians(30))
-    q = dc.candidates(robot, 300, tracker=tracker)
-    tips = robot(q).numpy()
-    angles = []
-    for tip in tips:
-        line, looks = position - (tip @ [*marker, 1.0])[:3], tip[:3, :3] @ direction
-        angles.append(math.acos(line @ looks / np.linalg.norm(line) / np.linalg.norm(looks)))
-    assert 29 < math.degrees(max(angles)) <= 30
+    tips = robot(dc.candidates(robot, 300, tracker=tracker)).numpy()
+    lines, looks = position - (tips @ [*marker, 1.0])[:, :3], tips[:, :3, :3] @ direction
+    angles = np.arccos((lines * looks).sum(1) / np.linalg.norm(lines, axis=1) / np.linalg.norm(looks, axis=1))
+    assert 29 < np.degrees(angles).max() <= 30
 
 
 def test_links_and_tool_stay_above_the_floor_and_outside_the_column(robot: Chain) -> None:
-    tool, tracker = torch.tensor([0.0, 0.0, 0.2, 1.0], dtype=torch.float64), dc.Tracker((9.0, 0.0, 0.0), (0, 0, 0.2))
+    tool, tracker = tensor([0.0, 0.0, 0.2, 1.0]), dc.Tracker((9.0, 0.0, 0.0), (0, 0, 0.2))
     q = dc.candidates(robot, 300, tracker=tracker, floor=0.1, column=(0.4, 0.0, 0.15))
     frames, tip = robot.joint_frames(q), robot(q)
     ends = torch.cat([frames[:, 1:, :3, 3], tip[:, None, :3, 3], (tip @ tool)[:, None, :3]], 1)
     assert float(ends[..., 2].min()) >= 0.1
-    for row in ends:
-        for a, b in pairwise(row):
-            share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
-            away = (a + share * (b - a) - torch.tensor([0.4, 0.0, 0.0]))[:, :2].norm(dim=1)
-            assert float(away.min()) >= 0.15 - 1e-12
+    for share in torch.linspace(0, 1, 9, dtype=torch.float64):
+        away = ends[:, :-1] + share * (ends[:, 1:] - ends[:, :-1]) - tensor([0.4, 0.0, 0.0])
+        assert float(away[..., :2].norm(dim=2).min()) >= 0.15 - 1e-12
     below = dc.candidates(robot, 300, column=(0.4, 0.0, 0.15, 0.3))
     inside = ((robot(below)[:, :2, 3] - torch.tensor([0.4, 0.0])).norm(dim=1) < 0.15).nonzero()[:, 0]
     assert len(inside)  # above its top
@@ -130,30 +113,21 @@ def test_mistakes_are_one_sentence(robot: Chain) -> None:
     )
 
 
-LINK = """<link name="{name}"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/>
-<geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>"""
-JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
-<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>"""
+BAR = """<link name="{child}"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/>
+<geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>
+<joint name="j{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/>
+<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>"""
 
 
-@pytest.fixture
-def folding(tmp_path: Path) -> Chain:
-    """Three bars of 0.4 m in a plane; the second joint turns without end."""
-    links = "".join(LINK.format(name=name) for name in ("one", "two", "three"))
-    kinds = [("a", "revolute", "base", "one", 0), ("b", "continuous", "one", "two", 0.4)]
-    kinds += [("c", "revolute", "two", "three", 0.4)]
-    joints = "".join(
-        JOINT.format(name=name, kind=kind, parent=parent, child=child, x=x) for name, kind, parent, child, x in kinds
-    )
-    path = tmp_path / "folding.urdf"
-    path.write_text(f'<robot name="folding"><link name="base"/>{links}{joints}</robot>')
-    return dc.load_urdf(path, "base", "three")
-
-
-def test_bodies_of_the_urdf_collide(folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_of_the_urdf_collide(robot: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three bars of 0.4 m in a plane; the second joint turns without end."""
     pytest.importorskip("pinocchio")
+    bars = (("base", "one", "revolute", 0), ("one", "two", "continuous", 0.4), ("two", "three", "revolute", 0.4))
+    text = "".join(BAR.format(parent=parent, child=child, kind=kind, x=x) for parent, child, kind, x in bars)
+    (tmp_path / "folding.urdf").write_text(f'<robot name="folding"><link name="base"/>{text}</robot>')
+    folding = dc.load_urdf(tmp_path / "folding.urdf", "base", "three")
     keep = collision_free(folding)
-    q = torch.tensor([[0.3, 0.0, 0.0], [0.0, 2.1, 2.1], [1.0, -2.1, -2.1], [0.0, 2.1, -2.1]], dtype=torch.float64)
+    q = tensor([[0.3, 0.0, 0.0], [0.0, 2.1, 2.1], [1.0, -2.1, -2.1], [0.0, 2.1, -2.1]])
     assert keep(q).tolist() == [True, False, False, True]  # a triangle closes, a zigzag does not
     found = dc.candidates(folding, 200, keep=keep)
     assert bool(keep(found).all())

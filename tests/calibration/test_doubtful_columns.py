@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import kind_named
+from numbers_bank import drawn, normal, tensor
 from product_bank import Case, simulated, with_usual_scales
+from source_bank import tracked
 from table_bank import refused, warned
-from tangent_bank import normal
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -29,7 +30,8 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
+from diffeo_calib.robots import Geometry, SimulatedArm, from_dh
+from diffeo_calib.robots.se3 import rotation
 
 HELD = {
     "poses": ("pose", "z"),
@@ -73,13 +75,10 @@ def test_a_stuck_column_is_named(name: str) -> None:
 def planar_rows(wrong: int = 0) -> tuple[Any, dc.Measurements]:
     """A planar robot, whose marker a flat device sees: the third coordinate is zero in all rows."""
     robot = from_dh([(0.5, 0, 0), (0.4, 0, 0), (0.2, 0, 0)], name="planar")
-    draw = torch.Generator().manual_seed(4)
-    q = 2.4 * torch.rand(60, 3, dtype=torch.float64, generator=draw) - 1.2
-    geometry = Geometry.nominal(robot, 1).with_tool(torch.tensor([[0.03, -0.02, 0.0]], dtype=torch.float64))
-    points = geometry.points(q + 2e-3 * torch.sin(q))
-    points[..., :2] += 2e-5 * torch.randn(60, 1, 2, dtype=torch.float64, generator=draw)
-    points[:wrong, 0, :2] += 0.03 * torch.randn(wrong, 2, dtype=torch.float64, generator=draw)
-    points[..., 2] = 0.0
+    q, flat = 2.4 * drawn(60, 3, seed=4) - 1.2, tensor([1.0, 1.0, 0.0])
+    points = Geometry.nominal(robot, 1).with_tool(tensor([[0.03, -0.02, 0.0]])).points(q + 2e-3 * torch.sin(q))
+    points = flat * (points + normal(60, 1, 3, seed=5, size=2e-5))
+    points[:wrong] += flat * normal(wrong, 1, 3, seed=6, size=0.03)
     return robot, dc.Measurements(q, points, robot.joint_names)
 
 
@@ -114,7 +113,7 @@ def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     assert quantum(values, turning=True) == (pytest.approx(step), words)
     assert quantum(arm.train.q[:, 1], turning=True) is None
     assert quantum(values[:6], turning=True) is None  # a few round numbers are no evidence
-    assert quantum(1e-6 * torch.rand(40, dtype=torch.float64), turning=True) is None  # nor is zero, of any step
+    assert quantum(1e-6 * drawn(40), turning=True) is None  # nor is zero, of any step
     values = (torch.linspace(0.1, 0.6, 40, dtype=torch.float64).sqrt() * 1e3).round() / 1e3
     assert quantum(values, turning=False) == (pytest.approx(1e-3), "1 mm")
 
@@ -166,7 +165,7 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
     if case == "other labels":
         points, labels = POINTS[torch.arange(ROWS), LABELS], torch.arange(ROWS) // 9
     elif case == "device":
-        points = points + torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.03, 0.01]]).double()[labels]
+        points = points + tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.03, 0.01]])[labels]
     elif case == "mass":
         heavy = [ARM.measure(ROWS, seed=5, payload=mass)[1][:, 0] for mass in (0.0, 10.0, 40.0)]
         points = torch.stack(heavy)[labels, torch.arange(ROWS)]
@@ -178,7 +177,7 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
 
 
 PAIR = SimulatedArm(seed=5, markers=2)
-PAIR_ROWS = dc.Measurements(*PAIR.measure(40, seed=1), PAIR.nominal.joint_names)
+PAIR_ROWS = tracked(PAIR, 40, 1)
 FIRST = PAIR_ROWS.points[:, 0]
 
 
@@ -189,10 +188,9 @@ def pair(first: Tensor, second: Tensor) -> dc.Measurements:
 def wished(digits: int, reached: float = 0.0) -> Tensor:
     """Places of the nominal robot in another frame, to so many digits of a mm, at joint values reached so well, rad."""
     q = PAIR_ROWS.q
-    poses = PAIR.nominal(q + reached * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype))
-    at = poses[:, :3, :3] @ poses.new_tensor([0.02, 0.03, 0.1]) + poses[:, :3, 3]
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.1], [0.3, 0.0, 0.2], [-0.1, -0.2, 0.0]], dtype=q.dtype))
-    return ((at @ turn.mT + 0.4) * 10.0 ** (3 + digits)).round() / 10.0 ** (3 + digits)
+    poses = PAIR.nominal(q + reached * normal(*q.shape))
+    at = poses[:, :3, :3] @ tensor([0.02, 0.03, 0.1]) + poses[:, :3, 3]
+    return (at @ rotation(tensor([-0.2, 0.1, 0.3])).mT + 0.4).round(decimals=3 + digits)
 
 
 def test_markers_that_are_no_measurements_are_refused() -> None:
@@ -201,7 +199,7 @@ def test_markers_that_are_no_measurements_are_refused() -> None:
         r"marker 1 follows the nominal robot to 0\.00.* mm, another one to",
         "marker 1 is a copy of marker 0",
     )
-    shifted = FIRST + torch.tensor([0.1, 0.0, 0.2], dtype=FIRST.dtype)
+    shifted = FIRST + tensor([0.1, 0.0, 0.2])
     refused(
         (follows, lambda: dc.calibrate(PAIR.nominal, pair(FIRST, wished(2)))),
         (follows, lambda: check_markers(PAIR.nominal, pair(FIRST, wished(9)))),
@@ -222,14 +220,6 @@ def test_a_marker_that_is_near_the_nominal_robot_is_measured_where_the_other_one
         check_markers(PAIR.nominal, pair(FIRST, near))
     elsewhere = PAIR.nominal(PAIR_ROWS.q.roll(1, 0))[:, :3, 3]
     assert not list(unmeasured_markers(PAIR.nominal, pair(elsewhere, near)))
-
-
-def test_markers_above_each_other_on_a_robot_that_turns_about_one_axis_are_two() -> None:
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    joints = [Joint(f"j{k}", "revolute", torch.eye(4, dtype=torch.float64), up, lower=-2.0, upper=2.0) for k in (0, 1)]
-    joints[1].origin[0, 3] = 0.4
-    robot = dc.Chain("planar", "base", "tip", joints)
-    q = 4.0 * torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
-    poses = robot(q)
-    first = poses[:, :3, 3] + 0.3 * poses[:, :3, 0] + 1e-3 * torch.sin(q[:, :1])
-    assert not list(unmeasured_markers(robot, dc.Measurements(q, torch.stack([first, first + 0.1 * up], 1))))
+    planar, data = planar_rows()  # markers above each other on a robot whose axes are parallel are two
+    above = torch.cat([data.points, data.points + tensor([0.0, 0.0, 0.1])], 1)
+    assert not list(unmeasured_markers(planar, dc.Measurements(data.q, above)))

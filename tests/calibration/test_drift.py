@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import torch
 from again_bank import true_error
+from numbers_bank import drawn, normal, tensor
 from reading_bank import readings, scales
 from table_bank import refused, warned
-from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -30,7 +30,7 @@ ROWS, OFFSET_RAD = 80, 4e-4
 
 def hours(count: int) -> Tensor:
     """Times in random order, from 3 to 7 h."""
-    return 3.0 + 4.0 * torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    return 3.0 + 4.0 * drawn(count, seed=1)
 
 
 def turned(q: Tensor, time: Tensor, offset: float = OFFSET_RAD) -> Tensor:
@@ -42,7 +42,7 @@ def turned(q: Tensor, time: Tensor, offset: float = OFFSET_RAD) -> Tensor:
 
 def drifting_rows(offset: float = OFFSET_RAD) -> dc.Measurements:
     q, time = ARM.sample(ROWS + 60, seed=4), hours(ROWS + 60)
-    points = ARM.true_points(turned(q, time, offset)) + 2e-5 * normal(ROWS + 60, 1, 3, seed=2)
+    points = ARM.true_points(turned(q, time, offset)) + normal(ROWS + 60, 1, 3, seed=2, size=2e-5)
     return dc.Measurements(q, points, ARM.nominal.joint_names).with_covariates(time=time)
 
 
@@ -97,7 +97,7 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     nominal = GeometryMap(geometry, elastic=True)
     zero = torch.zeros(nominal.parameters, dtype=torch.float64)
     unknowns = normal(13, seed=5)
-    size = unknowns * torch.tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * 6, dtype=torch.float64)
+    size = unknowns * tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * 6)
     a = ((time - time.min()) / (time.max() - time.min()) - 0.5)[:, None]
     plain = nominal(q, zero)
     centre = plain.view(-1, 3).mean(0)

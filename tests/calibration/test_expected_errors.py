@@ -1,13 +1,13 @@
 """What a model expects of itself, and what its parts explain, against the truth of a simulated arm."""
 
-import warnings
-
 import pytest
 import torch
 from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
 from kind_bank import kind_named, marked
+from numbers_bank import rms, tensor
 from product_bank import Case, simulated, with_usual_scales
+from table_bank import warned
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -18,7 +18,7 @@ from diffeo_calib.reports.analysis.findings import stages_of
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
-FAR = twist_transform(torch.tensor([0.03, -0.02, 0.01, 0.02, 0.01, -0.03], dtype=torch.float64))
+FAR = twist_transform(tensor([0.03, -0.02, 0.01, 0.02, 0.01, -0.03]))
 
 
 @pytest.mark.parametrize(("name", "free"), [("positions", False), ("ball in sockets", True)])
@@ -43,52 +43,31 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot() -> None:
     """The truth differs from the model as expected, after the marker has been put where it fits best."""
     arm, generator = arm_of("1 marker", 0), torch.Generator().manual_seed(0)
     data = measured(arm, "1 marker", CAMPAIGNS["tool never turned"](arm, 40, generator), generator)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that is the case
-        model = with_usual_scales(arm.nominal, data).model
+    model = warned(with_usual_scales, arm.nominal, data)[0].model
     found, q = ExpectedError.of(model), model.map.everywhere
     assert found.whole > 5 * found.workspace
     assert any("marker" in place for place in found.open_places)
     errors = (model(q).detach() - arm.true_points(q)).flatten(1)
-    apart = float(
-        OpenPlaces.of(model.map).without(errors.reshape(-1, 1)).view(errors.shape).square().sum(1).mean().sqrt()
-    )
+    apart = rms(OpenPlaces.of(model.map).without(errors.reshape(-1, 1)).view(errors.shape))
     assert 0.3 * apart < found.workspace < 6 * apart
     by_stage = expected_errors(model, stages_of(model))
     assert by_stage["calibrated"] == pytest.approx(found.workspace)
     assert by_stage["calibrated"] < by_stage["geometric"] < by_stage["nominal"] < 5e-3
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        moved = model.registered(data[:12])  # these rows leave it open again
-    again = ExpectedError.of(moved)
+    again = ExpectedError.of(warned(model.registered, data[:12])[0])  # these rows leave it open again
     assert again.whole > 5 * again.workspace
     assert again.open_places
 
 
 @pytest.mark.parametrize("name", marked())
 def test_usual_rows_leave_no_place_open(name: str) -> None:
-    found = ExpectedError.of(kind_named(name).model)
-    assert found.open_places == ()
-    assert found.workspace == found.whole
-
-
-@pytest.mark.parametrize("name", ["positions", "hidden markers", "poses", "ball in sockets"])
-def test_expectation_plan_and_stages_give_one_number(name: str) -> None:
+    """What is expected over the workspace is what a plan begins with, and the error of the last stage."""
     model = kind_named(name).model
     found, q = ExpectedError.of(model), model.map.everywhere
-    tracker = dc.Sensor.positions() if name == "ball in sockets" else None  # no random pose is in a socket
-    planned = dc.plan(model, q, 1, target=q, sensor=tracker).expected_rms[0]  # over a part of the targets
-    assert float(planned) == pytest.approx(found.whole, rel=0.1)
-    assert expected_errors(model, {"itself": model})["itself"] == pytest.approx(found.workspace)
-
-
-def rms(displacements: Tensor) -> float:
-    return 1e3 * float(displacements.reshape(-1, 3).square().sum(-1).mean().sqrt())
-
-
-def sizes(case: Case) -> dict[str, float]:
-    """Part -> displacement, mm."""
-    return {part.name: 1e3 * part.displacement for part in case.result.parts}
+    assert found.open_places == ()
+    assert found.workspace == found.whole == pytest.approx(expected_errors(model, {"itself": model})["itself"])
+    if name in ("positions", "hidden markers", "poses"):
+        planned = dc.plan(model, q, 1, target=q).expected_rms[0]  # over a part of the targets
+        assert float(planned) == pytest.approx(found.whole, rel=0.1)
 
 
 def pushed(arm: SimulatedArm, q: Tensor, errors: Tensor) -> Tensor:
@@ -98,13 +77,14 @@ def pushed(arm: SimulatedArm, q: Tensor, errors: Tensor) -> Tensor:
 
 def test_parts_with_every_source_of_error(arm: Case) -> None:
     """60 poses, noise 0.02 mm; the bounds are those of the sizes, gravity and shoulder share what both explain."""
-    source, found, q = simulated(1)[0], sizes(arm), arm.train.q
+    source, q = simulated(1)[0], arm.train.q
+    found = {part.name: part.displacement for part in arm.result.parts}
     assert list(found) == [
         *("geometry", "gravity on joints", "gravity on links"),
         *(f"transmission of {name}" for name in arm.robot.joint_names),
         *("coupled joint errors", "task space"),
     ]
-    beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
+    beyond_registration = register(source.nominal, q, source.truth.points(q)).rms
     assert found["geometry"] == pytest.approx(beyond_registration, rel=0.06)
     true = source.components(q)
     assert found["gravity on joints"] == pytest.approx(rms(pushed(source, q, true.gravity)), rel=0.25)
@@ -113,7 +93,7 @@ def test_parts_with_every_source_of_error(arm: Case) -> None:
         alone[:, joint] = true.transmission[:, joint] - true.transmission[:, joint].mean()
         assert found[f"transmission of {name}"] == pytest.approx(rms(pushed(source, q, alone)), rel=0.25), name
     for nothing in ("gravity on links", "coupled joint errors", "task space"):  # the arm has none of these
-        assert found[nothing] < 0.015
+        assert found[nothing] < 1.5e-5
     joints = true.transmission + true.gravity
     moved = arm.model(q).detach() - arm.model.geometry.points(q)
     assert rms(moved.flatten(1) - pushed(source, q, joints)) < 0.4 * rms(pushed(source, q, joints))

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from math import pi
 from typing import Any
 
 import pytest
 import torch
 from kind_bank import kind_named
+from numbers_bank import normal, rms
 from product_bank import simulated
 from table_bank import refused
 from tangent_bank import Setting, covariance
@@ -65,7 +67,7 @@ def test_unusable_models_are_refused() -> None:
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
 
-def drawn(lines: Any = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
+def drawn(lines: Any = LINES, *, q: Tensor | None = None) -> tuple[TangentData, Hyperparameters]:
     """Measurements of the model itself, drawn from its prior, with gear lines in addition; 150 poses by default."""
     arm = SimulatedArm(1)
     q = arm.sample(150, seed=3) if q is None else q
@@ -75,8 +77,7 @@ def drawn(lines: Any = LINES, *, q: Tensor | None = None, seed: int = 0) -> tupl
     data = TangentData(nominal, zero, q, arm.truth.points(q).flatten(1), sensor, Tails.none(len(q), 1))
     scales = defaults(data, 3e-5, Prior())
     matrix = data.linearisation(scales).gram() + torch.block_diag(*data.noise(scales))
-    noise = torch.randn(len(matrix), dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    y = data.y + (torch.linalg.cholesky(matrix) @ noise).view_as(data.y)
+    y = data.y + (torch.linalg.cholesky(matrix) @ normal(len(matrix))).view_as(data.y)
     for joint, frequency, amplitude in lines:
         y = y + amplitude * data.jacobian[..., joint] * (frequency * q[:, joint, None] + 0.7).sin()
     return replace(data, y=y), scales
@@ -133,21 +134,24 @@ def test_a_calibration_reports_its_lines_and_predicts_better() -> None:
     names = arm.nominal.joint_names
     assert {line.joint for line in result.gear_lines} == {names[0], names[1]}
     q = arm.sample(300, seed=9)
-    error = (result.model(q) - arm.true_points(q)).norm(dim=-1)
-    assert float(error.square().mean().sqrt()) < 5e-5  # 0.08 mm without the lines
+    assert rms(result.model(q) - arm.true_points(q)) < 5e-5  # 0.08 mm without the lines
+
+
+@cache
+def setting(rows: int = 60) -> Setting:
+    arm, measurements, _ = simulated(rows)
+    return Setting(arm.nominal, measurements)
 
 
 @pytest.mark.parametrize("joint", [0, 3])
 def test_the_axis_is_found(joint: int) -> None:
     """It is shifted and turned before the joint by smooth functions of its value; clean rows have none."""
-    arm, measurements, _ = simulated(60)
-    setting = Setting(arm.nominal, measurements)
-    data = setting.tangent_data
-    assert with_axis_errors(data, setting.scales, torch.arange(60)) is setting.scales
+    data, scales = setting().tangent_data, setting().scales
+    assert with_axis_errors(data, scales, torch.arange(60)) is scales
     x = data.x[:, joint, None]
     shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
     moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    found = with_axis_errors(replace(data, y=data.y + moved), setting.scales, torch.arange(60))
+    found = with_axis_errors(replace(data, y=data.y + moved), scales, torch.arange(60))
     ((axis, low, high, _),) = found.axes
     assert axis == joint
     assert low < float(x.min()) < float(x.max()) < high
@@ -157,27 +161,24 @@ def test_the_axis_is_found(joint: int) -> None:
 
 def test_a_device_that_drifts_while_rows_follow_an_axis_is_no_axis() -> None:
     """Where no row can tell the two, as of the first joint, the user is told."""
-    arm, measurements, _ = simulated(60)
-    setting = Setting(arm.nominal, measurements)
-    data, t = setting.tangent_data, torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    data, scales, t = setting().tangent_data, setting().scales, torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
     shape = torch.cat([(9 * t).sin(), (12 * t).cos(), t, 0 * t, 0 * t, 0 * t], 1)
     for joint in (3, 0):
         lines = data.x[:, joint].argsort().argsort()
         moved = 5e-4 * (data.sensitivities[..., :6] @ shape[lines][:, :, None])[..., 0]
         drifted = replace(data, y=data.y + moved)
         if joint:
-            assert with_axis_errors(drifted, setting.scales, lines) is setting.scales
+            assert with_axis_errors(drifted, scales, lines) is scales
         else:
             with pytest.warns(dc.DiffeoCalibWarning, match="may be a drift of the device"):
-                with_axis_errors(drifted, setting.scales, lines)
+                with_axis_errors(drifted, scales, lines)
 
 
 def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
-    arm, measurements, _ = simulated(14)
-    setting = Setting(arm.nominal, measurements)
+    plain, data = setting(14).scales, setting(14).tangent_data
     errors, length = torch.tensor([[3e-4, 2e-4]], dtype=torch.float64), torch.tensor([0.3], dtype=torch.float64)
     own = {"axes": ((2, -3.0, 3.0, 10),), "axis_errors": errors, "axis_lengthscale": length}
-    scales, data = replace(setting.scales, **own), setting.tangent_data
+    scales = replace(plain, **own)
     with_axis = data.with_position_errors(scales)
     assert_close(scales.from_logarithms(scales.logarithms()).axis_errors, errors, rtol=1e-12, atol=0)
     assert_close(scales.inflated(2.0).axis_errors, 2.0 * errors, rtol=1e-12, atol=0)
@@ -186,7 +187,7 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     functions = wave_angles(waves, data.x, torch).cos() * deviations[:, 0] / deviations[0, 0]  # (N, K)
     twists = data.sensitivities[..., 18:24] * deviations[0]
     added = torch.einsum("ik,jk,imc,jnc->imjn", functions, functions, twists, twists)
-    before, after = data.linearisation(setting.scales).gram(), with_axis.linearisation(scales).gram()
+    before, after = data.linearisation(plain).gram(), with_axis.linearisation(scales).gram()
     assert_close(after, before + added.reshape(before.shape), rtol=1e-12, atol=1e-16)
     places = torch.linspace(0.0, torch.pi, 2001, dtype=torch.float64)
     values = (torch.arange(1, 11) * places[:, None]).cos()[..., None] * deviations

@@ -1,10 +1,10 @@
 """Measured robots: 632 poses of a UR10 by a laser tracker, 114 of an FR3 whose camera sees a board."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import pytest
+import robot_data
 from product_bank import Case, covered, ur10_measurements
 
 import diffeo_calib as dc
@@ -39,19 +39,9 @@ def test_the_fit_converges_and_its_deviations_hold(ur10: Case) -> None:
 
 def fr3(folder: Path, *, poses: bool) -> tuple[dc.Chain, dc.Measurements]:
     """The robot by its published table, and the measurements of its camera, which have heavy tails."""
-    quarter = math.pi / 2
-    rows = [
-        *((0, 0, 0.333), (0, -quarter, 0), (0, quarter, 0.316), (0.0825, quarter, 0)),
-        *((-0.0825, -quarter, 0.384), (0, quarter, 0), (0.088, quarter, 0.107)),
-    ]
-    robot = dc.from_dh(rows, convention="craig")
-    joints = [f"q{i}_rad" for i in range(1, 8)]
-    position = ["cam_T03", "cam_T13", "cam_T23"]
-    rotation = {"rotation": [f"cam_T{i}{j}" for i in range(3) for j in range(3)], "convention": "matrix"}
-    csv, more = folder / "franka_fr3" / "franka_fr3_camera.csv", rotation if poses else {}
-    data = dc.read_measurements(csv, joints, position, length="m", angle="rad", **more)  # pyright: ignore[reportArgumentType]
-    assert len(data) == 114
-    return robot, data.with_joint_names(robot.joint_names)
+    found = robot_data.read(folder / "franka_fr3", robot_data.BUILT_IN["franka_fr3"], poses=poses)
+    assert len(found.measurements) == 114
+    return found.robot, found.measurements
 
 
 def test_heavy_tails_of_a_camera(ur10_folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from math_bank import normal
+from numbers_bank import drawn, normal, tensor
 from reading_bank import scales
 from table_bank import refused, warned
 from torch import Tensor
@@ -21,7 +21,6 @@ from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.simulated_arm import URDF_FILE
 
 ARM, ROWS = SimulatedArm(3), 80
-NOISE = 2e-5
 
 
 def said_of(rows: Any) -> list[str]:
@@ -32,20 +31,12 @@ def said_of(rows: Any) -> list[str]:
 @pytest.mark.parametrize("every", [2, 5])
 def test_tools_that_take_turns_are_named_with_their_rows(every: int) -> None:
     q, y = ARM.measure(ROWS, seed=1)
-    y[::every, 0] += ARM.truth.poses(q)[::every, :3, :3] @ torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    y[::every, 0] += ARM.truth.poses(q)[::every, :3, :3] @ tensor([3e-4, 0.0, 4e-4])
     (text,) = [one for one in said_of(dc.Measurements(q, y)) if "another tool" in one]
     lines = ", ".join(str(every * k) for k in range(5))
     assert text.startswith(f"{ROWS // every} of {ROWS} rows seem to have another tool or marker, 0.")
     assert f"mm away: lines {lines} and" in text
     assert 0.4 < float(text.split("marker, ")[1].split(" mm")[0]) < 0.6
-
-
-def payloads(change: Any, rows: int = ROWS) -> list[str]:
-    masses = torch.from_numpy(np.random.default_rng(5).choice([0.0, 5.0, 10.0], rows))
-    q = ARM.sample(rows, 2)
-    y = ARM.true_points(q, masses)
-    data = dc.Measurements(q, y + NOISE * normal(*y.shape, seed=3)).with_payload(change(masses.clone()))
-    return [one for one in said_of(data) if "payload" in one]
 
 
 @pytest.mark.parametrize(
@@ -59,7 +50,9 @@ def payloads(change: Any, rows: int = ROWS) -> list[str]:
     ],
 )
 def test_payloads_of_other_lines_and_units_are_named_and_right_ones_are_not(change: Any, rows: int, words: str) -> None:
-    assert [words in one for one in payloads(change, rows)] == [True] * bool(words)
+    masses = torch.from_numpy(np.random.default_rng(5).choice([0.0, 5.0, 10.0], rows))
+    data = dc.Measurements(*ARM.measure(rows, 2, masses)).with_payload(change(masses.clone()))
+    assert [words in one for one in said_of(data) if "payload" in one] == [True] * bool(words)
 
 
 @pytest.mark.parametrize(
@@ -97,12 +90,10 @@ def edited(tmp_path: Path, multiplier: float, base: str) -> dc.Tree:
 def measured(robot: dc.Tree, stroke: float = 0.0) -> tuple[Tensor, Tensor]:
     """Joint values (N, n), of a rail first, and places (N, 1, 3) of a point of a robot with usual errors, m."""
     low, high = robot.limits[-6:].unbind(1)
-    q = low + (high - low) * torch.from_numpy(np.random.default_rng(1).random((ROWS, 6)))
-    if robot.n > 6:
-        q = torch.cat([stroke * torch.from_numpy(np.random.default_rng(2).random((ROWS, 1))), q], 1)
+    q = torch.cat([stroke * drawn(ROWS, robot.n - 6, seed=2), low + (high - low) * drawn(ROWS, 6, seed=1)], 1)
     T = robot(q + 2e-4 * torch.sin(q))
-    y = T[:, :3, 3] + T[:, :3, :3] @ torch.tensor([0.03, 0.02, 0.1], dtype=torch.float64) + 1.0
-    return q, y[:, None] + NOISE * normal(ROWS, 1, 3, seed=4)
+    y = T[:, :3, 3] + T[:, :3, :3] @ tensor([0.03, 0.02, 0.1]) + 1.0
+    return q, y[:, None] + normal(ROWS, 1, 3, seed=4, size=2e-5)
 
 
 def doubted(robot: dc.Tree, q: Tensor, y: Tensor) -> list[tuple[str, float]]:
@@ -155,10 +146,9 @@ def larger(tmp_path: Path, factor: float) -> dc.Tree:
 
 def test_scales_of_robots_that_do_not_suit_are_refused_or_named(tmp_path: Path) -> None:
     q, y = SimulatedArm(0).measure(60, seed=9)
-    robot, other = larger(tmp_path, 1.4), SimulatedArm(77).measure(60, seed=3)
+    robot, other, data = larger(tmp_path, 1.4), SimulatedArm(77).measure(60, seed=3), dc.Measurements(q, y)
     model = dc.calibrate(robot, dc.Measurements(other[0], 1.4 * other[1])).model
     with pytest.warns(DiffeoCalibWarning, match="`scales_of` does not suit these rows: got leave-one-out errors"):
-        dc.calibrate(ARM.nominal, dc.Measurements(q, y), scales_of=[model])
-    data = dc.Measurements(q, y)
+        dc.calibrate(ARM.nominal, data, scales_of=[model])
     message = "`scales_of`, model 1: expected one of about 0.*got a reach of"
     refused((message, lambda: dc.calibrate(larger(tmp_path, 0.6), data, scales_of=[model])))

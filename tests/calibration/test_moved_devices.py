@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from kind_bank import kind_named
-from math_bank import normal
+from numbers_bank import normal, rms, tensor
 from product_bank import simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
 from table_bank import warned
@@ -53,11 +53,10 @@ def clean() -> tuple[dc.CalibrationResult, list[str]]:
     [((1.01,) * 3, "the size of the robot", 1.0), ((1.0, 1.001, 1.0), "the scale of the measuring frame along y", 0.1)],
 )
 def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: str, percent: float) -> None:
-    (q, y), scale = ARM.measure(ROWS, seed=1), torch.tensor(factors, dtype=torch.float64)
+    (q, y), scale = ARM.measure(ROWS, seed=1), tensor(factors)
     result, (text,) = lengths(dc.Measurements(q, y * scale))
     assert numbers(rf"{name} seems to differ by \+([\d.]+) %", text) == pytest.approx([percent], rel=0.25)
-    wrong = (y - y.mean((0, 1))) * (scale - 1)
-    assert result.expected.workspace == pytest.approx(float(wrong.square().sum(-1).mean().sqrt()), rel=0.3)
+    assert result.expected.workspace == pytest.approx(rms((y - y.mean((0, 1))) * (scale - 1)), rel=0.3)
 
 
 def test_a_wrong_link_is_the_robots_and_leaves_no_position_in_doubt() -> None:
@@ -84,8 +83,7 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     assert abs(right.lengths[0].value) < 3 * right.lengths[0].deviation < 0.004
     wrong, texts = lengths(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
     assert bool(texts) == noticed
-    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
-    assert found.unnoticed * found.motion == pytest.approx(float(moved), rel=0.15)
+    assert found.motion == pytest.approx(rms(y - y.mean((0, 1))), rel=0.15)
     said, size = str(wrong.lengths[0]), wrong.lengths[0]
     assert f"moves points by {1e3 * abs(size.value) * size.motion:.2g} mm" in said
     assert "may be wrong without a warning" in said
@@ -113,7 +111,7 @@ def test_the_controllers_own_positions_are_warned_about() -> None:
     """Also rounded to 0.1 mm, and as poses."""
     q = ARM.sample(ROWS, 1)
     poses = ARM.nominal(q)
-    y = poses[:, None, :3, 3] + torch.tensor([0.5, 0.2, 0.1], dtype=torch.float64)
+    y = poses[:, None, :3, 3] + tensor([0.5, 0.2, 0.1])
     poses[:, :3, 3] = (1e4 * y[:, 0]).round() / 1e4
     exact, rounded = (dc.Measurements(q, own, doubt=False) for own in (y, poses[:, None, :3, 3]))
     for data in (exact, rounded, dc.Measurements.from_poses(q, poses, doubt=False)):
@@ -169,7 +167,7 @@ def test_the_gain_is_that_of_the_definition() -> None:
 def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10_folder: Path) -> None:
     """Both shifts are the same there, and both are named."""
     robot, data = ur10_measurements(ur10_folder)
-    points = from_row(data.points[:100], 50, torch.tensor([6e-4, 0.0, 8e-4], dtype=torch.float64))
+    points = from_row(data.points[:100], 50, tensor([6e-4, 0.0, 8e-4]))
     moved = dc.Measurements(data.q[:100], points)
     with pytest.warns(DiffeoCalibWarning, match="these rows do not tell which") as caught:
         dc.calibrate(robot, moved, hyperparameters=ur10_scales())
@@ -178,10 +176,14 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
     assert all(what in text for what in ("the measuring device", "a marker", "near row 50"))
 
 
-def told(arm: SimulatedArm, q: Tensor, points: Tensor, *, given: bool = True) -> str | None:
+THIRD = SimulatedArm(3)
+Q, POINTS = THIRD.measure(ROWS, seed=1)
+
+
+def told(points: Tensor, *, given: bool = True) -> str | None:
     """What is said of changes in these rows, whose numbers tell their order, with scales given or selected."""
-    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(q)))
-    return said(arm.nominal, dc.Measurements(q, points)[mixed], given=given)
+    mixed = torch.from_numpy(np.random.default_rng(0).permutation(ROWS))
+    return said(THIRD.nominal, dc.Measurements(Q, points)[mixed], given=given)
 
 
 def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | None:
@@ -193,12 +195,10 @@ def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | 
 @pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (2, 5e-4), (5, 2e-3)])
 def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) -> None:
     """From row 30 of 80 on; of the first and the last joint another cause explains as much."""
-    arm = SimulatedArm(3)
-    q, points = arm.measure(80, seed=1)
-    after = q.clone()
+    after = Q.clone()
     after[30:, joint] += size
-    text = told(arm, q, points + arm.true_points(after) - arm.true_points(q))
-    name = arm.nominal.joint_names[joint]
+    text = told(POINTS + THIRD.true_points(after) - THIRD.true_points(Q))
+    name = THIRD.nominal.joint_names[joint]
     found, row = numbers(rf"^{name} seems to have changed by about ([\d.]+) mrad.*?near row (\d+)", text)
     assert found == pytest.approx(1e3 * size, rel=0.3)
     assert row == pytest.approx(30, abs=4)
@@ -208,16 +208,14 @@ def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) 
 @pytest.mark.filterwarnings("ignore:leave-one-out errors contradict")
 def test_a_model_holds_for_the_rows_before_a_slip() -> None:
     """Its error was half of the slip, with a quarter of the true places outside of the regions."""
-    arm = SimulatedArm(3)
-    q, points = arm.measure(80, seed=1)
-    points[50:, 0] += arm.truth.poses(q)[50:, :3, 1] * 1e-3
+    rows = dc.Measurements(Q, from_row(POINTS, 50, THIRD.truth.poses(Q)[50:, None, :3, 1] * 1e-3))
     with pytest.warns(DiffeoCalibWarning, match="near row 50.* the model holds for the rows before it"):
-        result = dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales())
+        result = dc.calibrate(THIRD.nominal, rows, hyperparameters=scales())
     assert result.partial
-    new = arm.sample(200, seed=2)
+    new = THIRD.sample(200, seed=2)
     mean, covariance = result.model.predict(new, noise=False)
-    errors = arm.true_points(new) - mean
-    assert errors.norm(dim=-1).square().mean().sqrt() < 1e-4
+    errors = THIRD.true_points(new) - mean
+    assert rms(errors) < 1e-4
     assert covariance.diagonal(dim1=-2, dim2=-1).sum() < 4 * errors.square().sum()
 
     def interrupting(task: str, done: int, total: int) -> None:
@@ -225,31 +223,27 @@ def test_a_model_holds_for_the_rows_before_a_slip() -> None:
             raise KeyboardInterrupt
 
     with pytest.warns(DiffeoCalibWarning, match="near row 50") as said:  # it is not opened then
-        assert dc.calibrate(arm.nominal, dc.Measurements(q, points), progress=interrupting).interrupted
+        assert dc.calibrate(THIRD.nominal, rows, progress=interrupting).interrupted
     assert not any("holds for" in str(one.message) for one in said)
 
 
-SHIFT = 4e-4 * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
-
-
 def test_a_slow_drift_is_told_from_a_jump() -> None:
-    arm = SimulatedArm(3)
-    q, points = arm.measure(80, seed=1)
-    drift = told(arm, q, points + torch.linspace(0, 1, 80, dtype=torch.float64)[:, None, None] * SHIFT)
+    shift = 4e-4 * tensor([0.6, 0.8, 0.0])
+    drift = told(POINTS + torch.linspace(0, 1, ROWS, dtype=torch.float64)[:, None, None] * shift)
     (size,) = numbers(r"^the measuring device or the robot's base seems to drift by about ([\d.]+) mm over", drift)
     assert size == pytest.approx(0.4, rel=0.2)
-    jump = told(arm, q, from_row(points, 25, SHIFT), given=False)
+    jump = told(from_row(POINTS, 25, shift), given=False)
     size, row = numbers(r"^the measuring device.* about ([\d.]+) mm near row (\d+)", jump)
     assert size == pytest.approx(0.4, rel=0.3)
     assert row == pytest.approx(25, abs=1)
-    assert told(arm, q, points) is None
+    assert told(POINTS) is None
 
 
 def test_a_device_that_turns_and_comes_back_is_named() -> None:
     """0.1 mrad at 3 m for a quarter of the rows was silent, with true errors five times as large."""
     arm = SimulatedArm(1)
     q, points = arm.measure(120, seed=1)
-    points[40:70] = points[40:70] @ rotation(torch.tensor([0.0, 6e-5, 8e-5], dtype=torch.float64)).mT
+    points[40:70] = points[40:70] @ rotation(tensor([0.0, 6e-5, 8e-5])).mT
     text = said(arm.nominal, dc.Measurements(q, points))
     found = numbers(r"^the measuring device .* moved more than once, near row (\d+) and row (\d+)", text)
     assert found == pytest.approx([40, 70], abs=3)

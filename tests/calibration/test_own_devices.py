@@ -10,14 +10,14 @@ import two_arms_bank
 from inclinometer import Inclinometers
 from kind_bank import kind_named
 from laser_line import Beams
+from numbers_bank import drawn, normal, rms, tensor
 from product_bank import simulated_poses, with_usual_scales
-from tangent_bank import normal
+from source_bank import tracked
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import KINDS, kind_of, register
 
@@ -48,9 +48,8 @@ def test_an_inclinometer_finds_how_it_is_mounted_and_makes_the_model_better() ->
 
 def test_a_frame_is_seen_beside_poses_only() -> None:
     arm = simulated_poses(1)[0]
-    seen, (q, points) = inclinometer.readings(arm, arm.sample(60)), arm.measure(20)
-    marked = dc.Measurements(q, points[:, :1], arm.nominal.joint_names)
-    for rows in (seen, dc.Observations.joined([marked, seen])):
+    seen = inclinometer.readings(arm, arm.sample(60))
+    for rows in (seen, dc.Observations.joined([tracked(arm, 20, 0, 0), seen])):
         with pytest.raises(MeasurementError, match=r"inclination.*beside measured poses"):
             dc.calibrate(arm.nominal, rows)  # pyright: ignore
     with pytest.raises(InputError, match="poses"):
@@ -74,17 +73,12 @@ ORIGINS = ("0 {side} 0.3", "0 0 0.2", "0 0 0.35", "0.3 0 0", "0.1 0 0", "0.1 0 0
 NEWTON_STEPS = 12
 
 
-def urdf() -> str:
-    """Two arms of six joints on one base."""
-    text = '<link name="base"/>'
-    for hand, side in zip(two_arms_bank.HANDS, (0.35, -0.35), strict=True):
-        links = ["base", *(f"{hand}_{k}" for k in range(6)), hand]
-        for k, (axis, origin) in enumerate(zip((*AXES, ""), (*ORIGINS, "0.1 0 0.05"), strict=True)):
-            kind = "revolute" if axis else "fixed"
-            text += f'<link name="{links[k + 1]}"/><joint name="{hand}_j{k}" type="{kind}"><parent link="{links[k]}"/>'
-            text += f'<child link="{links[k + 1]}"/><origin xyz="{origin.format(side=side)}"/>'
-            text += f'<axis xyz="{axis}"/><limit lower="-3" upper="3"/></joint>' if axis else "</joint>"
-    return f'<robot name="two_arms">{text}</robot>'
+JOINTS = [
+    (f"{hand}_j{k}", f"{hand}_{k - 1}" if k else "base", f"{hand}_{k}", origin.format(side=side), axis)
+    for hand, side in zip(two_arms_bank.HANDS, (0.35, -0.35), strict=True)
+    for k, (axis, origin) in enumerate(zip(AXES, ORIGINS, strict=True))
+]
+"""Two arms of six joints on one base."""
 
 
 def away(arms: two_arms_bank.TwoArms, q: Tensor, X: Tensor) -> Tensor:
@@ -98,7 +92,7 @@ def away(arms: two_arms_bank.TwoArms, q: Tensor, X: Tensor) -> Tensor:
 
 def holding(arms: two_arms_bank.TwoArms, X: Tensor, home: Tensor, rows: int, seed: int) -> Tensor:
     """Configurations (N, 12) in which both hands hold the tool, by Newton steps of the second arm."""
-    q = home + 0.6 * (2 * torch.rand(rows, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 1)
+    q = home + 0.6 * (2 * drawn(rows, 12, seed=seed) - 1)
     q[:, 6:] = home[6:]
     for _ in range(NEWTON_STEPS):
         J = torch.func.jacrev(lambda x: away(arms, x, X).sum(0))(q).movedim(1, 0)[..., 6:]  # (N, 6, 6)
@@ -110,15 +104,15 @@ def holding(arms: two_arms_bank.TwoArms, X: Tensor, home: Tensor, rows: int, see
 def relative_errors(model: Any, arms: Any, q: Tensor) -> float:
     """RMS distance of the second hand from where the first has it, against the truth, m."""
     found, true = (torch.linalg.inv(poses[:, 0]) @ poses[:, 1] for poses in (model.poses(q), arms.poses(q)))
-    return float((found - true)[:, :3, 3].norm(dim=1).square().mean().sqrt())
+    return rms((found - true)[:, :3, 3])
 
 
 @pytest.mark.slow
 def test_a_held_tool_makes_the_model_better_and_goes_through_verbs(tmp_path: Path) -> None:
-    (tmp_path / "arms.urdf").write_text(urdf())
+    (tmp_path / "arms.urdf").write_text(two_arms_bank.urdf(JOINTS, "0.1 0 0.05", 3.0))
     robot = dc.load_urdf(tmp_path / "arms.urdf", "base", list(two_arms_bank.HANDS))
     arms, names = two_arms_bank.TwoArms(robot), robot.joint_names
-    bent = torch.tensor([0.3, 0.6, 0.9, 0.2, -0.6, 0.1], dtype=torch.float64)
+    bent = tensor([0.3, 0.6, 0.9, 0.2, -0.6, 0.1])
     home = torch.cat([bent, bent * torch.tensor([-1, 1, 1, -1, 1, -1])])
     left, right = arms.poses(home[None])[0]
     X = torch.linalg.inv(left) @ right
@@ -128,13 +122,10 @@ def test_a_held_tool_makes_the_model_better_and_goes_through_verbs(tmp_path: Pat
         dc.Readings.of("held tool", rows, torch.zeros(len(rows), 6), None, names, numbers=6, doubt=False)
         for rows in (seen, kept)
     )
-    free = home + 0.8 * (2 * torch.rand(16, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) - 1)
-    turned = arms.poses(free)
-    turned[..., :3, :3] = rotation(2e-4 * normal(16, 2, 3, seed=6)) @ turned[..., :3, :3]
-    turned[..., :3, 3] += 2e-5 * normal(16, 2, 3, seed=7)
-    tracked = dc.Measurements.from_poses(free, turned, names, on=two_arms_bank.HANDS)
-    rows: Any = dc.Observations.joined([tracked, held])
-    alone = with_usual_scales(robot, tracked).model
+    free = home + 0.8 * (2 * drawn(16, 12, seed=8) - 1)
+    poses = dc.Measurements.from_poses(free, arms.noisy(free), names, on=two_arms_bank.HANDS)
+    rows: Any = dc.Observations.joined([poses, held])
+    alone = with_usual_scales(robot, poses).model
     found = with_usual_scales(robot, rows)
     assert relative_errors(found.model, arms, kept) < 0.5 * relative_errors(alone, arms, kept)
     assert_close(found.readings[0].devices.constants.view(3, 4)[:, 3], X[:3, 3], rtol=0, atol=2e-3)

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 import torch
+from numbers_bank import normal, tensor
 from reading_bank import AXES, POINTS, cameras, in_base, reading_errors, readings, scales
 from table_bank import refused, warned
-from tangent_bank import built, normal, shaken, tangent_covariance
+from tangent_bank import built, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
-from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing import readings as placed_readings
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import register_readings
@@ -25,12 +25,7 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.observation import ReadPoints
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import FixedPoints
-
-
-def registered(robot: Tree, data: dc.Readings) -> Identification:
-    return register_readings(Geometry.nominal(robot, 1), [data])
 
 
 @pytest.mark.parametrize(
@@ -57,12 +52,12 @@ def test_the_covariance_of_distances_is_that_of_positions_along_their_directions
     one = geometry.with_tool(geometry.tool[:1])
     nominal = type(setting.nominal)(one, elastic=True)
     theta = 1e-4 * normal(nominal.parameters, seed=4)
-    fixed = torch.tensor([3.0, 2.0, 1.0, 0.0], dtype=torch.float64).repeat(len(x), 1)
+    fixed = tensor([3.0, 2.0, 1.0, 0.0]).repeat(len(x), 1)
     observe = ReadPoints(FixedPoints.read, fixed, 3)
     y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
     tails = type(whole.tails).none(len(x), 1)
     data = TangentData(nominal, theta, x, y, NoiseModel.alike(len(x), 1, 1), tails, observe=observe)
-    scales = replace(shaken(setting.scales, 3), task_amplitude=torch.tensor(1e-3, dtype=torch.float64))
+    scales = replace(shaken(setting.scales, 3), task_amplitude=tensor(1e-3))
     A = torch.block_diag(*observe.slope(nominal(x, theta)))
     expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T
     assert_close(data.linearisation(scales).gram(), expected, rtol=1e-9, atol=1e-16)
@@ -86,7 +81,7 @@ def test_cameras_find_the_robot_but_for_its_size() -> None:
     """The size is as uncertain as the warning says; the rest is found; nothing is better on new rows by chance."""
     arm = SimulatedArm(3)
     data = readings(arm, "image", 130, noise=2e-5)
-    train, new = data.rows(slice(0, 100)), data.rows(slice(100, 130))
+    train, new = data.rows(slice(100)), data.rows(slice(100, None))
     result, said = calibrated(arm, train)
     assert said.startswith("the readings hold too little length: the robot's size is known to 0.")
     q = arm.sample(200, 9)
@@ -107,7 +102,7 @@ def test_cameras_find_the_robot_but_for_its_size() -> None:
 def touched(arm: SimulatedArm, heights: tuple[float, ...], rows: int) -> dc.Readings:
     """The ball brought to planes, or to blocks of these heights on them, by steps along the true Jacobian."""
     q, which = arm.sample(6 * rows, 4), torch.arange(6 * rows) % 3
-    at = torch.tensor(heights, dtype=torch.float64)[torch.arange(6 * rows) // 3 % len(heights)]
+    at = tensor(heights)[torch.arange(6 * rows) // 3 % len(heights)]
     base = arm.truth.base[:3, :3]
     for _ in range(25):
         miss = at - ((in_base(arm, q) * AXES[which]).sum(1) - 0.3)
@@ -168,7 +163,7 @@ def test_readings_in_another_unit_are_refused() -> None:
         (readings(arm, "distance", 51), 1e-3, "small"),
     ):
         with pytest.raises(MeasurementError, match=f"1000 times too {size}: check the units of the readings"):
-            registered(arm.nominal, replace(data, values=factor * data.values))
+            register_readings(Geometry.nominal(arm.nominal, 1), [replace(data, values=factor * data.values)])
 
 
 @pytest.mark.slow
@@ -186,8 +181,9 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(placed_readings, "BALLS_TRIED", 2)
     monkeypatch.setattr(placed_readings, "STARTS_STEPS", 20)
     arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
+    three = dc.Readings.distances(data.q[:24], data.values[:24])  # devices as one
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
-        registered(arm.nominal, dc.Readings.distances(data.q[:24], data.values[:24]))  # three devices as one
+        register_readings(Geometry.nominal(arm.nominal, 1), [three])
     kept = data.rows(data.device != 1)
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}
@@ -195,14 +191,11 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def calibrated_by(rows: Any) -> Callable[[], object]:
         return lambda: dc.calibrate(arm.nominal, rows)
 
-    names, swapped = ["rare"] * 3 + ["often"] * 57, list(reversed(arm.nominal.joint_names))
+    names, swapped = ["rare"] * 3 + ["often"] * 57, data.with_joint_names(arm.nominal.joint_names[::-1])
     refused(
         ("at least 40 rows", calibrated_by(data.rows(slice(0, 30)))),
         ("'rare' in 3 rows", calibrated_by(dc.Readings.distances(data.q, data.values, names))),
-        (
-            "joints are not those of robot",
-            calibrated_by(dc.Readings.distances(data.q, data.values, joint_names=swapped)),
-        ),
+        ("joints are not those of robot", calibrated_by(swapped)),
         ("Readings", calibrated_by(data.q)),
         ("above 0", lambda: dc.Readings.distances(data.q, -data.values)),
         ("60 names", lambda: dc.Readings.heights(data.q, 0.0, ["table"])),

@@ -14,13 +14,15 @@ from typing import Any
 
 import again_bank
 import pytest
-import reading_bank
 import torch
-from again_bank import ELSEWHERE, NEW, OTHERWISE, WORN, model, positions, true_error
+from again_bank import ELSEWHERE, FACTOR, WORN, fitted, positions, true_error
 from campaigns import CAMPAIGNS
 from deformation_bank import made
 from kind_bank import kind_named
+from numbers_bank import normal, tensor
 from product_bank import Case, covered, simulated, simulated_poses, ur10_measurements, ur10_scales, with_usual_scales
+from reading_bank import readings
+from source_bank import laden, resting
 from table_bank import refused, warned
 from torch import Tensor
 from torch.distributions import MultivariateNormal
@@ -29,32 +31,35 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.drift import grown, parts_of
 from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
+from diffeo_calib.calibration.recalibration.register import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.robots.se3 import rotation, transforms, twist_transform
 
 pytestmark = pytest.mark.slow  # fits by the dozen
 few_rows = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
-ARM, JOINTS = again_bank.arm(), again_bank.arm().nominal.joint_names
-THERE = transforms(rotation(again_bank.one(0.3, -2.0, 0.7)), again_bank.one(1.5, -0.4, 0.2))
+ARM, JOINTS, NEW = again_bank.arm(), again_bank.arm().nominal.joint_names, 30
+THERE = transforms(rotation(tensor([0.3, -2.0, 0.7])), tensor([1.5, -0.4, 0.2]))
 """A measuring frame far from the first one."""
+TRIPOD = twist_transform(tensor([2e-3, -1e-3, 0.5e-3, 1e-3, -2e-3, 0.5e-3]))
+old = again_bank.model
 
 
 def measured(robot: SimulatedArm = ARM, rows: int = NEW, seed: int = 5) -> dc.Measurements:
     return positions(robot, rows, seed, THERE)
 
 
+def of_ball(kind: str, robot: SimulatedArm = ARM, rows: int = 2 * NEW, seed: int = 5, mass: Any = None) -> Any:
+    found = readings(robot, kind, rows, noise=2e-5, seed=seed, payload=mass)
+    return found if mass is None else found.with_payload(mass)
+
+
 def with_tool(*shift: float, robot: SimulatedArm = ARM) -> SimulatedArm:
     """The arm with its marker elsewhere, m."""
     other = copy.copy(robot)
-    other.truth = replace(robot.truth, tool=robot.truth.tool + again_bank.one(*shift))
+    other.truth = replace(robot.truth, tool=robot.truth.tool + tensor(shift))
     return other
-
-
-@cache
-def old() -> dc.CalibratedKinematics:
-    return model(positions)
 
 
 @cache
@@ -63,11 +68,30 @@ def again() -> dc.Recalibration:
     return dc.recalibrate(old(), measured())
 
 
+def two_sessions() -> dc.Measurements:
+    """The tripod is moved by 2 mm after half of the rows."""
+    parts = positions(ARM, 15, 5), positions(ARM, 15, 55, ELSEWHERE @ TRIPOD)
+    return dc.Measurements.joined(parts).with_sessions(["before"] * 15 + ["after"] * 15)
+
+
+OTHERWISE: dict[str, tuple[str, Callable[[], Any]]] = {
+    "positions, then two sessions": ("", two_sessions),
+    "positions, then sockets": ("", lambda: resting(ARM, 3, 5)),
+    "positions, then heights": ("", lambda: of_ball("height")),
+    "heights, then a tracker": ("heights", lambda: positions(ARM, NEW, 5)),
+    "sockets, then distances": ("ball in sockets", lambda: of_ball("distance")),
+}
+"""Measured in one way and then in another: the kind of the model, and new rows of the same robot."""
+
+
+def model(kind: str) -> dc.CalibratedKinematics:
+    return kind_named(kind).model if kind else old()
+
+
 @cache
 def recalibrated(name: str) -> dc.Recalibration:
-    """A case's model and the new rows of the same robot."""
-    case = OTHERWISE[name]
-    return warned(dc.recalibrate, model(case.old), case.new(ARM, case.count, 5))[0]
+    kind, rows = OTHERWISE[name]
+    return warned(dc.recalibrate, model(kind), rows())[0]
 
 
 def rms(model: Any, robot: SimulatedArm = ARM) -> float:
@@ -80,9 +104,8 @@ def rms(model: Any, robot: SimulatedArm = ARM) -> float:
 
 def test_new_rows_add_to_what_the_old_model_knew() -> None:
     found, error = again(), rms(again().model)
-    fitted = dc.calibrate(ARM.nominal, measured(), hyperparameters=reading_bank.scales()).model
     assert error < 0.9 * rms(old().registered(measured(), learn=False))
-    assert error < 0.7 * rms(fitted)
+    assert error < 0.7 * rms(fitted(measured()))
     assert 0.9 < covered(found.model, measured(rows=100, seed=6)) <= 1.0
     assert (found.marker, found.outliers, found.changes.found) == ("same", (), ())
     assert 1.0 <= found.inflation < 1.5
@@ -104,8 +127,7 @@ def test_recalibrated_once_more() -> None:
 def test_old_rows_and_new_rows_together_are_one_calibration() -> None:
     """In the same place, with the same scales: as accurate as if all rows had been measured at once."""
     new, test = positions(ARM, 40, 8), positions(ARM, 100, 9)
-    both = dc.Measurements.joined([positions(ARM, len(old().configurations), 1), new])
-    once = dc.calibrate(ARM.nominal, both, hyperparameters=reading_bank.scales()).model
+    once = fitted(dc.Measurements.joined([positions(ARM, len(old().configurations), 1), new]))
     twice = dc.recalibrate(old(), new, drift="none").model
     assert dc.evaluate(twice, test).rms < 1.08 * dc.evaluate(once, test).rms
 
@@ -114,7 +136,7 @@ def test_old_rows_and_new_rows_together_are_one_calibration() -> None:
 @pytest.mark.parametrize("name", OTHERWISE)
 def test_new_rows_of_another_kind_make_the_model_better(name: str) -> None:
     found = recalibrated(name)
-    assert true_error(found.model, ARM) < true_error(model(OTHERWISE[name].old), ARM)
+    assert true_error(found.model, ARM) < true_error(model(OTHERWISE[name][0]), ARM)
     assert found.fit.converged
     assert (found.marker, found.changes.found) == ("same", ())
     assert found.rms_after <= found.rms_before
@@ -123,7 +145,7 @@ def test_new_rows_of_another_kind_make_the_model_better(name: str) -> None:
 def test_every_session_has_its_own_frame() -> None:
     frames: Any = next(iter(recalibrated("positions, then two sessions").placement))
     assert frames.names == ("before", "after")
-    between = ELSEWHERE @ again_bank.TRIPOD @ torch.linalg.inv(ELSEWHERE)
+    between = ELSEWHERE @ TRIPOD @ torch.linalg.inv(ELSEWHERE)
     between = between if frames.reference == 0 else torch.linalg.inv(between)
     assert_close(frames.transforms[1 - frames.reference][:3, :3], between[:3, :3], rtol=0, atol=3e-4)
 
@@ -137,13 +159,14 @@ def test_a_ball_the_model_does_not_know_is_one_more_marker() -> None:
 @few_rows
 def test_old_rows_of_readings_keep_their_payloads() -> None:
     """Heights are linear in the points: rows linearised around the fit are the measured ones but for each plane."""
-    laden = model(again_bank.laden_height)
-    away = laden.map.linearised_rows()[1] - laden.map.measured()
+    masses = tensor([0.0, 4.0, 10.0])[torch.arange(60) // 3 % 3]
+    first = fitted(of_ball("height", seed=1, mass=masses))
+    away = first.map.linearised_rows()[1] - first.map.measured()
     for device in range(3):  # devices take turns
         assert_close(away[device::3], away[device::3].mean().expand_as(away[device::3]), rtol=0, atol=1e-6)
-    again = dc.recalibrate(laden, again_bank.laden_height(ARM, 30, 5)).model
+    again = dc.recalibrate(first, of_ball("height", rows=30, mass=masses[:30])).model
     for mass in (0.0, 10.0):
-        before, after = (true_error(one.with_payload(mass), ARM, mass) for one in (laden, again))
+        before, after = (true_error(one.with_payload(mass), ARM, mass) for one in (first, again))
         assert after < 1.1 * before
 
 
@@ -198,10 +221,11 @@ def test_a_worn_joint_is_named_and_followed(arm: Case) -> None:
 
 
 @few_rows
-@pytest.mark.parametrize("rows", [again_bank.payloads, again_bank.height])
-def test_a_worn_joint_is_found_by_rows_of_other_kinds(rows: again_bank.Rows) -> None:
+@pytest.mark.parametrize("name", ["payloads", "heights"])
+def test_a_worn_joint_is_found_by_rows_of_other_kinds(name: str) -> None:
     """60 rows in sockets leave 0.5 mm, and distances show a change of no joint."""
-    found: Any = dc.compare(model(rows), rows(ARM.worn(WORN, again_bank.FACTOR), NEW, 5))
+    worn = SimulatedArm(seed=int(name == "payloads")).worn(WORN, FACTOR)
+    found: Any = dc.compare(model(name), laden(worn, NEW, 5) if name == "payloads" else of_ball("height", worn, NEW))
     (change,) = found.changes.found
     assert change.part == JOINTS[WORN]
     assert str(found).startswith(f"{change.part} has changed")
@@ -212,16 +236,12 @@ def test_a_worn_joint_is_found_by_rows_of_other_kinds(rows: again_bank.Rows) -> 
 @pytest.mark.parametrize(("size", "named"), [(0.2, True), (0.015, False)])
 def test_a_change_of_everything_is_followed_named_or_not(arm: Case, size: float, *, named: bool) -> None:
     """Geometry and transmissions: where a named geometry alone might differ the errors are 1.5 times as large."""
-    aged, generator = copy.copy(simulated(1)[0]), torch.Generator().manual_seed(3)
-
-    def drawn(count: int) -> Tensor:
-        return size * torch.randn(count, generator=generator, dtype=torch.float64)
-
+    aged = copy.copy(simulated(1)[0])
     theta, own = torch.zeros(aged.truth.size, dtype=torch.float64), aged.truth.slices["joints"]
-    theta[own] = 1e-3 * drawn(own.stop - own.start)
+    theta[own] = normal(own.stop - own.start, seed=3, size=1e-3 * size)
     aged.truth = aged.truth.absorb(theta)
     joints, waves, amplitudes, phases = aged._waves
-    aged._waves = joints, waves, amplitudes * (1 + 2 * drawn(len(amplitudes))), phases
+    aged._waves = joints, waves, amplitudes * (1 + normal(len(amplitudes), seed=4, size=2 * size)), phases
     new, test = measured(aged, 20), measured(aged, 100, 6)
     found = dc.recalibrate(arm.model, new)
     assert ("geometry" in [change.part for change in found.changes.found]) == named
@@ -245,18 +265,18 @@ def test_another_tool_of_a_worn_robot_is_found() -> None:
 
 
 @few_rows
-@pytest.mark.parametrize("rows", [positions, again_bank.distance])
-def test_another_marker_or_ball_is_neither_a_change_nor_a_contradiction(rows: Any) -> None:
+@pytest.mark.parametrize("name", ["", "distances"])
+def test_another_marker_or_ball_is_neither_a_change_nor_a_contradiction(name: str) -> None:
     robot = with_tool(0.03, -0.12, 0.1)
-    found = dc.recalibrate(model(rows), rows(robot, 2 * NEW, 5))
+    found = dc.recalibrate(model(name), of_ball("distance", robot) if name else positions(robot, 2 * NEW, 5))
     assert (found.marker, found.changes.found, found.outliers) == ("other", (), ())
-    assert true_error(found.model, robot) < true_error(model(rows), ARM)
+    assert true_error(found.model, robot) < true_error(model(name), ARM)
 
 
 def test_outliers_hardly_count() -> None:
     rows, points = measured(), measured().points.clone()
     for row, sign in {0: -1, 3: 1, 5: -1, 10: 1}.items():  # that everything has changed explains them less well
-        points[row] += sign * again_bank.one(0.003, -0.004, 0.0)
+        points[row] += sign * tensor([0.003, -0.004, 0.0])
     spoilt = dc.recalibrate(old(), dc.Measurements(rows.q, points))
     assert spoilt.outliers == (0, 3, 5, 10)
     assert rms(spoilt.model) < 1.2 * rms(again().model)
@@ -339,8 +359,8 @@ def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
 
 
 def test_a_model_with_payloads_is_compared_with_one_without_any_under_none() -> None:
-    loaded = model(again_bank.payloads)
-    for pair in ((loaded, old()), (old(), loaded)):
+    loaded, plain = model("payloads"), model("positions")
+    for pair in ((loaded, plain), (plain, loaded)):
         found = dc.compare(*pair)
         assert found.payload == 0.0
         assert found.rms < 3.0 * found.expected
@@ -349,14 +369,9 @@ def test_a_model_with_payloads_is_compared_with_one_without_any_under_none() -> 
 
 def test_ratios_are_those_of_the_definition() -> None:
     """Largest densities over all levels of noise and sizes of the change, with explicit matrices."""
-    draws = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=draws, dtype=torch.float64)
-
-    shapes, roots, noise = normal(18, 4), {"a": normal(6, 3, 2), "b": normal(6, 3, 1)}, normal(6, 3, 5)
+    shapes, roots, noise = normal(18, 4), {"a": normal(6, 3, 2, seed=1), "b": normal(6, 3, 1, seed=2)}, normal(6, 3, 5)
     base, noise = shapes @ shapes.T, noise @ noise.mT
-    residual = 3.0 * roots["a"] @ normal(2) + normal(6, 3)
+    residual = 3.0 * roots["a"] @ normal(2, seed=3) + normal(6, 3, seed=4)
     seen = torch.ones_like(residual, dtype=torch.bool)
     given = SimpleNamespace(C=base, slopes=base[:, :0], prior=base[:0, :0])
     rows: Any = SimpleNamespace(weighted_noise=noise, visible=seen, residual=residual, given=given)
@@ -376,30 +391,24 @@ def test_ratios_are_those_of_the_definition() -> None:
         assert found[name].variance == pytest.approx(float(SIZES[best.argmax()]))
 
 
-# --- rows that are doubted or refused ---------------------------------------------------------------------------------
-
-
 def test_known_noise_of_the_new_rows_counts() -> None:
-    draw = torch.randn(NEW, 1, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    noisy = dc.Measurements(measured().q, measured().points + 1e-3 * draw, std=1e-3)
+    noisy = dc.Measurements(measured().q, measured().points + normal(NEW, 1, 3, seed=3, size=1e-3), std=1e-3)
     found = dc.recalibrate(old(), noisy, drift="none")
     assert found.outliers == ()
     assert covered(found.model, measured(rows=200, seed=6)) > 0.9
+    noisy.std[0] *= 2.0  # by which rows differ, whatever a usual row errs by
+    noise = weighed(place_again(old(), with_attributes(noisy, std=1e-2 * noisy.std)), "same").noise
+    assert_close(noise[0] - noise[1], 3e-10 * torch.eye(3, dtype=torch.float64), rtol=1e-4, atol=1e-14)
 
 
 def test_what_is_warned_about() -> None:
     turns = (THERE @ ARM.truth.base @ ARM.nominal(measured().q))[:, :3, :3]
-    places = measured().points + (turns @ again_bank.one(1e-3, 0.0, 0.0))[:, None], 1.006 * measured().points
+    places = measured().points + 1e-3 * turns[:, None, :, 0], 1.006 * measured().points
     remounted, large = (with_attributes(measured(), points=points) for points in places)
-    unchanged = {"drift": "none"}
+    other = measured(SimulatedArm(seed=9))
     for words, verb, rows, options in (
         (r"are 1\.00\d\d times those that the model predicts; check the scale", dc.compare, large, {}),
-        (
-            "of 30 new rows contradict .*belongs to this robot",
-            dc.recalibrate,
-            measured(SimulatedArm(seed=9)),
-            unchanged,
-        ),
+        ("of 30 new rows contradict .*belongs to this robot", dc.recalibrate, other, {"drift": "none"}),
         (r'markers have moved by .* mm, although marker="same"', dc.compare, remounted, {"marker": "same"}),
     ):
         _, texts = warned(verb, old(), rows, **options)
@@ -421,13 +430,10 @@ def test_what_is_refused(tmp_path: Path) -> None:
     posed = kind_named("poses")
     dc.save(old().registered(new), tmp_path / "model")
     learnt: Any = dc.load(tmp_path / "model")
-    placed, ball = learnt.registered(measured(rows=15, seed=6), learn=False), again_bank.sockets(ARM, 30, 5)
+    placed, ball = learnt.registered(measured(rows=15, seed=6), learn=False), resting(ARM, 3, 5)
 
     def again(rows: Any = new, model: Any = None, **options: Any) -> Callable[[], object]:
         return lambda: dc.recalibrate(model or old(), rows, **options)
-
-    def of_size(factor: float) -> dc.Measurements:
-        return dc.Measurements(new.q, factor * new.points, doubt=False)
 
     refused(
         ("fitted to 60 of these 60 measurements: they would count twice; pass rows", again(first)),
@@ -441,9 +447,10 @@ def test_what_is_refused(tmp_path: Path) -> None:
         (r"expected 1 marker\(s\), got 2 marker.*register", again(simulated(9, markers=2)[1])),
         (r"expected 1 marker\(s\), got poses.*register", again(simulated_poses(9)[1])),
         ("the new rows: expected poses", again(ball.with_joint_names(posed.robot.joint_names), posed.model)),
-        (r"no place of device and markers explains these rows.*`length`", again(of_size(1e3))),
-        (r"no place of device and markers explains these rows.*`length`", again(of_size(1e-3))),
-        (r"do not tell where the measuring device stands.*several joints", again(still)),
+        (
+            r"no place of device and markers explains these rows.*`length`",
+            again(dc.Measurements(new.q, 1e3 * new.points, doubt=False)),
+        ),
         (r"do not tell where the measuring device stands.*several joints", lambda: dc.compare(old(), still)),
         ("models of one robot", lambda: dc.compare(old(), made("slides"))),
     )

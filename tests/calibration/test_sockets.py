@@ -9,22 +9,17 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named, rigid_rms
+from kind_bank import kind_named
+from numbers_bank import normal, rigid_rms, rms, tensor
 from reading_bank import DISTANCES, readings, scales
-from reading_bank import scales as usual
 from simulated_sockets import SocketRows, rest_in_sockets
+from source_bank import resting, tracked
 from table_bank import refused, warned
 from tangent_bank import covariance
-from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
-from diffeo_calib.calibration.identification.identification import (
-    KindRows,
-    Rows,
-    estimated,
-    held_parameters,
-)
+from diffeo_calib.calibration.identification.identification import KindRows, Rows, estimated, held_parameters
 from diffeo_calib.calibration.identification.registration import register, register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
@@ -93,14 +88,12 @@ def test_a_size_that_is_not_the_robots_is_warned_about() -> None:
 PAIR = ("0", "1")
 
 
-@pytest.fixture(scope="module")
-def plain() -> SimulatedArm:
-    return SimulatedArm(seed=2)
+BARE = SimulatedArm(seed=2)
 
 
 @pytest.fixture(scope="module")
-def some(plain: SimulatedArm) -> SocketRows:
-    return rest_in_sockets(plain, seed=2, places=3, rows=6)
+def some() -> SocketRows:
+    return rest_in_sockets(BARE, seed=2, places=3, rows=6)
 
 
 def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> SocketReadings:
@@ -108,13 +101,13 @@ def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: obj
     return dc.Measurements.from_sockets(rows.q, names or rows.names, **given)  # pyright: ignore[reportArgumentType]
 
 
-def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
+def test_rows_and_distances_that_cannot_be(some: SocketRows) -> None:
     bare: Any = {"distances": None, "distance_std": None}
-    tracked, resting = MIXED.source.rows.parts
-    few = dc.Measurements.joined([tracked.rows([0, 1]), resting])
+    device, resting = MIXED.source.rows.parts
+    few = dc.Measurements.joined([device.rows([0, 1]), resting])
 
     def staged(data: SocketReadings) -> Callable[[], object]:
-        return lambda: place(plain.nominal, data, silent)
+        return lambda: place(BARE.nominal, data, silent)
 
     refused(
         (
@@ -139,32 +132,32 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         ({"distances": {PAIR: 0.06}}, "check between which sockets it is"),
     ):
         with pytest.warns(dc.DiffeoCalibWarning, match=words):
-            place(plain.nominal, table(some, **options), silent)
+            place(BARE.nominal, table(some, **options), silent)
 
 
-def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
+def test_rows_in_a_wrong_socket_are_named(some: SocketRows) -> None:
     names = list(some.names)
     names[3], names[20] = "2/1", "0/0"
     with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
-        placed = place(plain.nominal, table(some, tuple(names)), silent)
+        placed = place(BARE.nominal, table(some, tuple(names)), silent)
     weights = placed.identification.tails.weights.flatten()
     assert (weights < 1e-3).nonzero()[:, 0].tolist() == [3, 20], "the other rows of these sockets count"
 
 
 @pytest.mark.filterwarnings("ignore:the known distance")
-def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: SocketRows) -> None:
+def test_names_that_say_nothing_are_warned_about(some: SocketRows) -> None:
     names = tuple(some.names[(7 * row) % 36] for row in range(36))
     with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
-        place(plain.nominal, table(some, names), silent)
+        place(BARE.nominal, table(some, names), silent)
 
 
-def test_a_tool_that_never_turns(plain: SimulatedArm, some: SocketRows) -> None:
+def test_a_tool_that_never_turns(some: SocketRows) -> None:
     q = some.q[:1].repeat(12, 1)
-    q = q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    q = q + normal(*q.shape, size=1e-4)
     data = dc.Measurements.from_sockets(q, ["a"] * 12)
-    found = register_sockets(Geometry.nominal(plain.nominal), data.q, data.device)
+    found = register_sockets(Geometry.nominal(BARE.nominal), data.q, data.device)
     with pytest.raises(MeasurementError, match="the tool hardly turns"):
-        check_socket_registration(plain.nominal, data, found)
+        check_socket_registration(BARE.nominal, data, found)
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:
@@ -206,13 +199,9 @@ MIXED = kind_named("mixture")
 """Marker 0 is the ball; the tracker sees marker 1."""
 
 
-def rms(errors: Tensor) -> float:
-    return float(errors.square().sum(-1).mean().sqrt())
-
-
 def test_several_set_ups_of_the_device() -> None:
     """Rows in sockets belong to no set-up, and the places of the robot to all."""
-    T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
+    T = twist_transform(tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1]))
     device, resting = MIXED.source.rows.parts
     second, truth = torch.arange(len(device)) % 3 == 1, MIXED.source.truth
     points = torch.where(second[:, None, None], device.points @ T[:3, :3].mT + T[:3, 3], device.points)
@@ -225,12 +214,10 @@ def test_several_set_ups_of_the_device() -> None:
 
 @pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
 def test_rows_of_another_robot() -> None:
-    bend = torch.zeros(6, dtype=torch.float64)
-    bend[4] = 0.05
-    tracked, resting = MIXED.source.rows.parts
-    other = with_attributes(resting, q=resting.q + bend, distances=())
+    device, resting = MIXED.source.rows.parts
+    other = with_attributes(resting, q=resting.q + tensor([0.0, 0.0, 0.0, 0.0, 0.05, 0.0]), distances=())
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
-        place(MIXED.robot, dc.Measurements.joined([tracked, other]), silent)
+        place(MIXED.robot, dc.Measurements.joined([device, other]), silent)
 
 
 def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
@@ -250,27 +237,23 @@ def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
 # --- tables of several kinds ------------------------------------------------------------------------------------------
 
 PLAIN = SimulatedArm(3)
-NAMES = PLAIN.nominal.joint_names
-NOISE = 2e-5
 
 
 def read(kind: str, count: int) -> dc.Readings:
-    return readings(PLAIN, kind, count, noise=NOISE)
+    return readings(PLAIN, kind, count, noise=2e-5)
 
 
 def fit_of(data: dc.Observations) -> Any:
     """With the noise of each kind given."""
-    other = torch.full((len(data.parts) - 1,), NOISE, dtype=torch.float64)
-    return dc.calibrate(PLAIN.nominal, data, hyperparameters=replace(usual(), other_noise=other))  # type: ignore[arg-type]
+    noise = replace(scales(), other_noise=tensor([2e-5] * (len(data.parts) - 1)))
+    return dc.calibrate(PLAIN.nominal, data, hyperparameters=noise)  # type: ignore[arg-type]
 
 
 def test_sockets_and_distances_alone() -> None:
     """As good as the model says; errors of every kind are judged by themselves, and better than by geometry."""
-    rows = rest_in_sockets(PLAIN, seed=3, places=4, rows=5)
-    sockets = dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances=DISTANCES, distance_std=1e-5)
-    data: Any = dc.Observations.joined([sockets, read("distance", 36)])
+    data: Any = dc.Observations.joined([resting(PLAIN, 4, 5), read("distance", 36)])
     result, q = fit_of(data), PLAIN.sample(200, 9)
-    error = rigid_rms(result.model(q).detach(), PLAIN.true_points(q))
+    error = rigid_rms(result.model(q), PLAIN.true_points(q))
     assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
     assert result.fit.converged
     kinds = result.errors(data)
@@ -281,11 +264,9 @@ def test_sockets_and_distances_alone() -> None:
 
 @pytest.mark.slow
 def test_the_order_of_the_rows_does_not_matter() -> None:
-    tracked = dc.Measurements(*PLAIN.measure(20, seed=4), NAMES)
-    data: Any = dc.Observations.joined([tracked, read("distance", 24), read("height", 24)])
+    data: Any = dc.Observations.joined([tracked(PLAIN, 20, 4), read("distance", 24), read("height", 24)])
     order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
     order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
     mixed = data.rows(order.tolist())
-    assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
     one, other = (fit_of(rows).model(PLAIN.sample(20, 9)) for rows in (data, mixed))
     torch.testing.assert_close(other, one, rtol=0, atol=1e-6)

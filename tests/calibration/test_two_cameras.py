@@ -13,27 +13,17 @@ import pytest
 import torch
 from command_bank import Command
 from kind_bank import Kind, kind_named
-from product_bank import usual_scales
-from simulated_camera import (
-    BOARD_PRIOR,
-    CAMERA,
-    CAMERA_BESIDE,
-    CameraArm,
-    fixed_camera_arm,
-    images_of_both,
-)
+from numbers_bank import tensor
+from simulated_camera import BOARD_PRIOR, CAMERA, CAMERA_BESIDE, fixed_camera_arm, images_of_both
 from table_bank import refused
-from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.files import camera_text, read_camera
-from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [
@@ -41,13 +31,7 @@ pytestmark = [
     pytest.mark.slow,
 ]
 
-SCALES = usual_scales(SimulatedArm().nominal)
-FIXED: Any = {"camera_on_tool": False, "board": BOARD_PRIOR}
-
-
-@cache
-def arms() -> tuple[CameraArm, CameraArm]:
-    return fixed_camera_arm(70), fixed_camera_arm(70, second=True)
+ARMS = fixed_camera_arm(70), fixed_camera_arm(70, second=True)
 
 
 @cache
@@ -57,27 +41,24 @@ def kind() -> Kind:
 
 @cache
 def data() -> Any:
-    return images_of_both(arms(), (33, 27), 0.1)
+    return images_of_both(ARMS, (33, 27), 0.1)
 
 
-def of_corners(corners: Tensor | None = None, **known: Any) -> Any:
-    """The same images with other corners, or other arguments."""
-    own: dict[str, Any] = {"camera": (1280, 960), "seen_by": data().camera_names, **FIXED, **known}
-    return dc.Measurements.from_images(data().q, data().corners if corners is None else corners, **own)
-
-
-def places(on_tool: bool) -> list[Tensor]:
-    """Of the left and the right camera, in the robot's base or on the tool, m."""
-    if on_tool:
-        return [twist_transform(torch.tensor(own, dtype=torch.float64)) for own in (CAMERA, CAMERA_BESIDE)]
-    return [torch.linalg.inv(arm.arm.truth.base) for arm in arms()]
+def of_corners(**known: Any) -> Any:
+    """The same images with other arguments."""
+    own = {"corners": data().corners, "camera": (1280, 960), "seen_by": data().camera_names, **known}
+    return dc.Measurements.from_images(data().q, board=BOARD_PRIOR, camera_on_tool=False, **own)  # pyright: ignore
 
 
 def check_hand_eyes(model: Any, largest_std: float, *, on_tool: bool = True) -> None:
-    """Every camera is where it is, by the deviations that are told of it."""
+    """Every camera is where it is, in the robot's base or on the tool, by the deviations that are told of it."""
     found = HandEye.of_each(model, camera_on_tool=on_tool)
     assert sorted(found) == ["left", "right"]
-    for name, truth in zip(("left", "right"), places(on_tool), strict=True):
+    held, standing = (
+        [twist_transform(tensor(own)) for own in (CAMERA, CAMERA_BESIDE)],
+        [each.arm.truth for each in ARMS],
+    )
+    for name, truth in zip(found, held if on_tool else [torch.linalg.inv(own.base) for own in standing], strict=True):
         known = found[name].camera
         away = known.pose[:3, :3] @ truth[:3, :3].mT
         turn = 0.5 * (away - away.mT)[[2, 0, 1], [1, 2, 0]]
@@ -87,14 +68,14 @@ def check_hand_eyes(model: Any, largest_std: float, *, on_tool: bool = True) -> 
 
 
 def test_every_camera_is_where_it_is_and_has_its_lens() -> None:
-    swapped = images_of_both(arms(), (30, 33), 0.1)  # the other one holds the frame
-    for model in (kind().model, dc.calibrate(kind().robot, swapped, hyperparameters=SCALES).model):
+    swapped = images_of_both(ARMS, (30, 33), 0.1)  # the other one holds the frame
+    for model in (kind().model, dc.calibrate(kind().robot, swapped, hyperparameters=kind().scales).model):
         check_hand_eyes(model, 2e-3, on_tool=False)
     check_hand_eyes(kind_named("two cameras on the tool").model, 1e-4)
     placed = next(own for own in kind().model.placement if own.cameras)
     lenses = [placed.cameras[name].camera for name in ("left", "right")]
     assert_close(lenses[0].board, lenses[1].board, rtol=0, atol=0)
-    for lens, arm in zip(lenses, arms(), strict=True):
+    for lens, arm in zip(lenses, ARMS, strict=True):
         assert float(((lens.unknowns - arm.camera.unknowns) / lens.deviations).abs().max()) < 4.5
 
 
@@ -106,15 +87,6 @@ def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> 
     assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
     alone = own.moved.rows([name == "right" for name in own.moved.camera_names])
     check_hand_eyes(dc.recalibrate(own.model, alone).model, 1e-4)
-
-
-def test_the_size_of_the_board_is_known_once() -> None:
-    scale = UNKNOWNS.index("scale")
-    known = [float(camera.deviations[scale]) for camera in data().cameras.values()]
-    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.02)  # images alone show no size
-    again = of_corners(camera=data().cameras)
-    known = [float(camera.deviations[scale]) for camera in again.cameras.values()]
-    assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.03)
 
 
 def test_the_files_of_each_camera_begin_with_its_name(tmp_path: Path) -> None:
@@ -155,39 +127,34 @@ def test_tables_of_several_cameras_that_cannot_be() -> None:
 
 
 def test_every_camera_and_session_warns_of_a_board_of_another_size() -> None:
-    larger = data().corners.new_tensor([1.04] * 3 + [1] * 2)
-    q, corners = arms()[0].shown(0.1)
-    seen = dc.Measurements.from_images(q, corners * larger, (1280, 960), **FIXED)
-    for rows in (of_corners(data().corners * larger), seen.with_sessions(["day 1"] * 40 + ["day 2"] * (len(q) - 40))):
-        with pytest.warns(dc.DiffeoCalibWarning, match=r"size of the board.*[34].\d % larger"):
-            place(kind().robot, rows, silent)
+    rows = of_corners(corners=data().corners * tensor([1.04] * 3 + [1.0] * 2)).with_sessions(
+        ["day 1"] * 30 + ["day 2"] * 30
+    )
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"size of the board.*[34].\d % larger"):
+        place(kind().robot, rows, silent)
 
 
-def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> None:
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With a file of each camera."""
+    for name, camera in kind().data.cameras.items():
+        (tmp_path / f"{name}.yaml").write_text(camera_text(camera))
+    return tmp_path
+
+
+def test_each_camera_has_a_file_of_its_own(command: Command, folder: Path) -> None:
     table, options = kind().table()
-    shutil.copy(table, tmp_path / "corners.csv")
-    for name, camera in kind().data.cameras.items():
-        (tmp_path / f"{name}.yaml").write_text(camera_text(camera))
-    files = [f"--reading=corners={tmp_path / f'{name}.yaml'}" for name in ("left", "right")]
+    files = [f"--reading=corners={folder / f'{name}.yaml'}" for name in ("left", "right")]
     others = [word for word in options if "corners" not in word and word != "--reading"]
-    words = ["fit", tmp_path / "corners.csv", *kind().robot_options, *others, "--holdout", "0"]
-    words += ["-o", tmp_path / "m.safetensors"]
+    words = ["fit", table, *kind().robot_options, *others, "--holdout", "0", "-o", folder / "m.safetensors"]
     command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: kind().result)
-    done = command(*words, *files)
-    assert done.code == 0, done.err
-    assert "camera 'right' in the robot's base (hand-eye transform)" in done.out
-    done = command(*words, files[0], "--reading=corners=1280,960")
-    assert done.code == 1, done.out
-    assert "1280,960" in done.err
+    assert "camera 'right' in the robot's base (hand-eye transform)" in command.ran(*words, *files).out
+    assert "1280,960" in command.failed(*words, files[0], "--reading=corners=1280,960")
 
 
-def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path) -> None:
-    table, _ = kind().table("new")
-    shutil.copy(table, tmp_path / "corners.csv")
-    for name, camera in kind().data.cameras.items():
-        (tmp_path / f"{name}.yaml").write_text(camera_text(camera))
-    done = command("init", tmp_path / "corners.csv", kind().urdf, "-o", tmp_path / "campaign.toml")
-    assert done.code == 0, done.err
+def test_init_proposes_the_files_of_the_cameras(command: Command, folder: Path) -> None:
+    tmp_path = Path(shutil.copy(kind().table("new")[0], folder / "corners.csv")).parent
+    command.ran("init", tmp_path / "corners.csv", kind().urdf, "-o", tmp_path / "campaign.toml")
     text = (tmp_path / "campaign.toml").read_text()
     assert "left.yaml" in text
     assert "right.yaml" in text

@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.cameras.board import LENS, BoardPrior, project, project_slopes, real_board
 from diffeo_calib.cameras.files import camera_text, read_camera
-from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sees, sighted, sighted_by_several
+from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sees, shown, sighted, sighted_by_several
 from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -50,7 +50,7 @@ def test_derivatives_of_pixels_and_those_of_opencv() -> None:
 
 
 def test_the_formula_of_a_board_and_what_a_camera_sees() -> None:
-    """Boards as those of its images were: not from farther away, from behind, nor outside of the image."""
+    """Boards as those of its images were: not nearer, farther, behind, outside or folded into the image."""
     point, board = FOUND.poses.new_tensor([0.03, 0.02, 0.0]), FOUND.poses.new_tensor([1e-3, 2e-3, 0.01, 0.02, 0.03])
     bent = 0.1 * (0.01 * 0.3**2 + 0.02 * 0.3 * 0.2 + 0.03 * 0.2**2)
     expected = torch.tensor([1.003 * 0.03, 0.999 * 0.02, bent], dtype=torch.float64)
@@ -64,8 +64,14 @@ def test_the_formula_of_a_board_and_what_a_camera_sees() -> None:
     found = camera.view.near, camera.view.far, camera.view.facing
     assert found == pytest.approx([float(each) for each in (away.min(), away.max(), cosines.min())])
     behind = rotation(torch.tensor([[torch.pi, 0.0, 0.0]], dtype=torch.float64)) @ poses[:, :3, :3]
-    for R, place in ((poses[:, :3, :3], 2.0 * middle), (behind, middle), (poses[:, :3, :3], middle + away.max())):
-        assert not bool(sees(camera, transforms(R, place - R @ camera.corners.mean(0))).any())
+    R = poses[:, :3, :3]
+    wrong = [(R, factor * middle) for factor in (0.4, 2.0, -1.0)] + [(behind, middle), (R, middle + away.max())]
+    for turn, place in wrong:
+        assert not bool(sees(camera, transforms(turn, place - turn @ camera.corners.mean(0))).any())
+    folding = replace(camera, unknowns=camera.unknowns.clone())
+    folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
+    aside = middle.new_tensor([0.72, 0.0, 0.4]).expand(len(R), 3)  # tangent 1.8 comes back to 0.05
+    assert not bool(shown(folding, transforms(R, aside)).any())
 
 
 def test_truth_is_found_within_its_deviations() -> None:

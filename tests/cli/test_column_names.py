@@ -113,6 +113,23 @@ def test_which_columns_are_the_joints() -> None:
     assert not guess_joints(names, ARM)
     assert joints_without_column(names, ARM) == ["forearm"]
     assert guess_joints([*names, "E1"], ARM)[0].names[3] == "E1"
+    assert guess_joints(["E1", *names], ARM)[0].names[3] == "E1"
+    seven = ["A1", "A2", "E1", "A3", "A4", "A5", "A6"]  # a seventh axis between the others
+    assert guess_joints([*seven, "X", "Y", "Z"], [f"lbr_A{k}" for k in range(1, 8)])[0].names == seven
+
+
+@pytest.mark.parametrize(
+    ("columns", "joints"),
+    [
+        ("x_axis,y_axis,c,a", "x_axis,y_axis,c_axis,a_axis"),
+        ("Az (deg),Alt (deg)", "azimuth,altitude"),
+        ("θ1/deg,θ2/deg,d3/mm,θ4/deg", "joint1,joint2,joint3,joint4"),
+    ],
+)
+def test_columns_named_after_joints_each_in_its_way(columns: str, joints: str) -> None:
+    names, places = columns.split(","), ["X", "Y", "Z"]
+    assert guess_joints([*places, *names], joints.split(","))[0].names == names
+    assert not guess_joints([*places, *names[:-1]], joints.split(","))
 
 
 PAGE = Path(__file__).parents[2] / "scripts/docs/pages/howto/makers.md"

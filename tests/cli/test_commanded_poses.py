@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import BOARD, CAMERA, DOWN, bent, cells, drawn, flange, seen, turned, without_frames, write_columns
+from commanded_bank import BOARD, CAMERA, DOWN, bent, cells, drawn, flange, seen, turned, write_columns
 from documentation_bank import write_commanded_tables
+from numbers_bank import rigid_rms
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -317,7 +318,7 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any
     field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
     assert field.shape == (32, 9)
     place, add, std = field.double().split(3, 1)
-    assert without_frames(bent(place + add), place) < 0.15 * without_frames(bent(place), place)
+    assert rigid_rms(bent(place + add), place) < 0.15 * rigid_rms(bent(place), place)
     expected = dc.load(tmp_path / "t.safetensors").predict(place, noise=False)[1][:, 0].diagonal(dim1=1, dim2=2).sqrt()
     assert_close(std, expected, rtol=0.05, atol=1e-7)  # the device stands upright
 
@@ -358,7 +359,7 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     header, *rows = cells(tmp_path / "p.csv")
     assert {row[header.index("status")] for row in rows} == {"reached"}
     sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3
-    assert without_frames(bent(sent), went) < 0.15 * without_frames(bent(went), went)
+    assert rigid_rms(bent(sent), went) < 0.15 * rigid_rms(bent(went), went)
     model: Any = dc.load(tmp_path / "t.safetensors")
     at, *ends = torch.zeros(3, 1, 2, dtype=torch.float64) + torch.eye(3, 2, dtype=torch.float64).roll(1, 0)[:, None]
     here, x, y = (model.tool_poses(one, frame="measuring")[0, :3, 3] for one in (at, *ends))
@@ -438,7 +439,7 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     kinematics = runpy.run_path("my_delta.py")["kinematics"]
     nominal, exact = kinematics(q), 1.001 * kinematics(q + torch.tensor([0.1, -0.05, 0.08]))  # without noise
     assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
-    assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * without_frames(nominal, exact)
+    assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * rigid_rms(nominal, exact)
     command.ran("plan", model, "-n", "3", *pose, "-o", "n.csv")
     assert cells(Path("n.csv"))[0] == ["x", "y", "z", "rank"]
     done = command.ran("correct", model, "targets.csv", *pose, "-o", "c.csv")
@@ -450,4 +451,4 @@ def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkey
     command.ran("predict", model, again, "--robot-pose", "x,y,z", *MEASURED[2:], "-o", "a.csv")
     reached = [[float(cell) for cell in row[3:6]] for row in cells(Path("a.csv"))[1:]]
     wanted = nominal[:5] - nominal[:5].mean(0)
-    assert without_frames(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device
+    assert rigid_rms(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device

@@ -9,6 +9,7 @@ from math import degrees, pi
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from command_bank import Command
@@ -104,6 +105,8 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     assert "expected some that explain the rows far better, got left_waist_joint" in text
     right = [f"right_{name}" for name in NAMES], q
     assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    numbered = [f"right q{k}" for k in range(6)], q
+    assert proposed(numbered, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
     places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "R")]
     both = (([f"left_{name}" for name in NAMES], q.roll(1, 0)), (places[0], points.roll(1, 0)), (places[1], points))
     assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
@@ -278,6 +281,19 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     q[:, 2] *= -1
     found, _ = proposed((["up", "one [rad]", "two [rad]"], q), (XYZ, points))
     assert found["joints"] == "up,one [rad],-{two [rad]}"
+    _, text = proposed((["q1", "q2"], q[:, [0, 2]]), (XYZ, points))
+    assert "2 numbered columns do not say which of 3 joints they are" in text
+    q, points = lift(tmp_path)
+    gon = q * q.new_tensor([1.0, GON, GON])
+    found, _ = proposed((["up", "one [gon]", "two [gon]"], gon), (["East", "North", "Up"], points))
+    assert (found["joints"], found["angle"]) == ("up,0.9*{one [gon]},0.9*{two [gon]}", "deg")
+    assert found["position"] == ["East,North,Up"]
+    head = LIFT.replace('<origin xyz=".5 0 0"/>', "").replace('"prismatic"', '"fixed"')
+    (tmp_path / "arm.urdf").write_text(head)  # axes that meet in a point: the rows do not tell the unit of length
+    places = dc.load_urdf(tmp_path / "arm.urdf")(q[:, 1:])[:, :3, 3]
+    found, text = proposed((["one", "two"], q[:, 1:]), (XYZ, places))
+    assert "length" not in found
+    assert '# length = "mm"  # the robot explains the rows in each' in text
 
 
 @pytest.mark.slow
@@ -328,6 +344,14 @@ def test_no_robot_that_fits(count: int, per_degree: float, message: str, tmp_pat
     assert message in text
     assert not entries
     assert not (tmp_path / "c.toml").exists()
+
+
+def test_a_column_of_texts_names_the_set_ups(tmp_path: Path, frame: Any, init: Proposed) -> None:
+    """Under any name, where the robot explains the rows of each text but not all of them."""
+    frame["Ort"] = ["Halle", "Tor"] * (ROWS // 2)
+    frame.loc[1::2, XYZ] = frame.loc[1::2, XYZ].to_numpy() @ np.diag([-1.0, -1.0, 1.0]) + 900.0
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert init(tmp_path / "t.csv", tmp_path / "arm.urdf")[0]["session"] == "Ort"
 
 
 def test_what_explains_the_rows_is_said(proposed: Proposed) -> None:

@@ -114,13 +114,13 @@ def test_a_registered_robot_carries_its_payload() -> None:
     ],
 )
 def test_exchanged_markers_are_named(verb: Callable[[Any, Any], Any], order: list[int], named: str) -> None:
-    model, new = again_bank.model(positions, 3), positions(again_bank.arm(3), 24, 7)
+    model, new = again_bank.model(3), positions(again_bank.arm(3), 24, 7)
     with pytest.warns(DiffeoCalibWarning, match=f"markers {named}, or.* seem to be exchanged"):
         verb(model, with_attributes(new, points=new.points[:, order]))
 
 
 def test_markers_that_moved_are_not_exchanged() -> None:
-    arm, model = again_bank.arm(3), again_bank.model(positions, 3)
+    arm, model = again_bank.arm(3), again_bank.model(3)
     new = positions(arm, 24, 7)
     turns = again_bank.ELSEWHERE[:3, :3] @ arm.truth.marker_poses(new.q)[..., :3, :3]
     shifts = torch.tensor([[2e-3, 1e-3, 0.0], [-1e-3, 3e-3, 2e-3], [3e-2, -4e-2, 1e-2]], dtype=torch.float64)

@@ -210,9 +210,10 @@ def test_joints_alone_and_records(tmp_path: Path) -> None:
     with pytest.warns(DiffeoCalibWarning, match=r"prismatic joints reach 250.5 m: they look like millimetres"):
         metres = read_joints(path, TableFormat("m", "deg", ";", ",", joints=["slide"], kinds=["prismatic"]))
     assert_close(metres, torch.tensor([[250.5], [-100.0]], dtype=torch.float64), rtol=0, atol=0)
-    (tmp_path / "t.json").write_text('[{"joints": [0.1, 0.2]}]')
-    with pytest.raises(MeasurementError, match=r"t.json' is no table: expected CSV, .*, got .json; write one"):
-        read_joints(tmp_path / "t.json", TableFormat("m", "rad", joints=JOINTS))
+    for name in ("t.json", "t.ls"):
+        (tmp_path / name).write_text('{"joints": [0.1')
+        with pytest.raises(MeasurementError, match=rf"{name}' is no table: expected CSV, .*, got .{name[2:]}; write"):
+            read_joints(tmp_path / name, TableFormat("m", "rad", joints=JOINTS))
 
 
 @pytest.mark.parametrize("content", [(HEADER + ROWS + ROWS).encode(), b"PK\x03\x04\xff\xfe"])

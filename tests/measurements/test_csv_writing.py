@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 import torch
-from product_bank import sliding_measurements, sliding_robot
-from table_bank import POSITION, held, in_order, random_poses, read_table, some, values
+from numbers_bank import normal as values
+from product_bank import erring, sliding_robot
+from table_bank import POSITION, held, in_order, random_poses, read_table, some
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -146,7 +147,7 @@ def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: P
 @pytest.mark.parametrize("units", [("mm", "m"), ("m", "mm")])
 def test_slides_keep_their_unit(units: tuple[str, str], tmp_path: Path) -> None:
     robot, path = sliding_robot(), tmp_path / "t.csv"
-    data = sliding_measurements(robot, 3)
+    data = erring(robot, 3)
     table = table_format(Units(length=units[0], angle="deg", joint_length=units[1]))
     write_measurements(path, data, table, joints=robot)
     again = read_table(path, robot, POSITION, table)

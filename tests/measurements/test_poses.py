@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numbers_bank import normal as values
 from scipy.spatial.transform import Rotation
-from table_bank import CONVENTIONS, ORDERS, held, in_order, random_poses, random_rotations, refused, values
+from table_bank import CONVENTIONS, ORDERS, held, in_order, random_poses, random_rotations, refused
 from torch import Tensor
 from torch.testing import assert_close
 

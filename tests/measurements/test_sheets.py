@@ -1,5 +1,6 @@
 """Spreadsheets, arrays of NumPy and variables of MATLAB hold the same rows as a CSV file."""
 
+import json
 import re
 import sys
 from collections.abc import Callable
@@ -62,6 +63,8 @@ def _struct(path: Path) -> None:
     savemat(path, {"log": {"q": JOINTS, "p": PLACES}})
 
 
+RECORDS = [{"q": q, "log": {"p": p, "note": "a,b"}} for q, p in zip(JOINTS.tolist(), PLACES.tolist(), strict=True)]
+LOG = "log_p_x,log_p_y,log_p_z"
 WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "a spreadsheet": ("t.xlsx", _book, *NAMES),
     "the sheet with rows": ("t.xlsx", _two_sheets, *NAMES),
@@ -73,6 +76,8 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
     "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
     "a structure": ("t.mat", _struct, "log_q_1,log_q_2", "log_p_x,log_p_y,log_p_z"),
+    "lines of JSON": ("t.jsonl", lambda path: path.write_text("\n".join(map(json.dumps, RECORDS))), "q_1,q_2", LOG),
+    "a list of JSON": ("t.json", lambda path: path.write_text(json.dumps(RECORDS, indent=1)), "q_1,q_2", LOG),
 }
 
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from table_bank import held, in_order, random_poses, says, some, values
+from numbers_bank import normal as values
+from table_bank import held, in_order, random_poses, says, some
 from torch import Tensor
 from torch.testing import assert_close
 

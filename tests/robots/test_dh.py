@@ -146,6 +146,11 @@ FILES = {
         "Gelenk;Type;alpha [Grad];a [mm];d [mm];theta [deg]",
         [[f"A{k}", r.kind[0].upper(), *deg(r.alpha), 1e3 * r.a, 1e3 * r.d, *deg(r.theta)] for k, r in enumerate(ROWS)],
     ).replace(".", ","),
+    "words of another language, inches": lines(
+        ";",
+        "Achse;Typ;Type;Drehwinkel [rad];Versatz [in];Länge [inch];Verdrehung [rad]",
+        [[f"A{k}", "関節", r.kind, r.theta, r.d / 0.0254, r.a / 0.0254, r.alpha] for k, r in enumerate(ROWS)],
+    ),
     "units without brackets, a comment": lines(
         "\t",
         "i\ta_mm\tsigma\td_mm\talpha_deg\ttheta_deg\tmass",
@@ -179,7 +184,8 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_spellings_orders_and_units(name: str, tmp_path: Path) -> None:
-    (tmp_path / "arm.csv").write_text(FILES[name], encoding="utf-8")
+    page = "gb18030" if "greek" in name else "utf-8"
+    (tmp_path / "arm.csv").write_text(FILES[name], encoding=page)
     table = DHFile.read(tmp_path / "arm.csv")
     assert not table.convention
     for convention in ("standard", "craig"):
@@ -187,7 +193,7 @@ def test_spellings_orders_and_units(name: str, tmp_path: Path) -> None:
         torch.testing.assert_close(chain(Q), from_dh(ROWS, convention)(Q), rtol=0, atol=1e-10)
         assert chain.kinds == ("revolute", "revolute", "prismatic", "revolute")
     assert (chain.name, chain.base, chain.tip) == ("arm", "base", "tip")
-    first = "A0" if "makers" in name else "joint_1"
+    first = "A0" if "makers" in name or "language" in name else "joint_1"
     assert chain.joint_names[0] == first
 
 

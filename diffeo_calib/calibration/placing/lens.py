@@ -30,6 +30,8 @@ from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explain
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
 from diffeo_calib.sensors.set_ups import TRANSFORMS
 
+EXACT_SIZE = 1e-4
+"""Standard deviation of the size of a board that was made or measured with care, a share."""
 SIZE_WARNED = 0.006
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
 FOCUS = "lock focus and zoom of the camera; until then this counts as noise of the images"
@@ -71,12 +73,13 @@ class BoardSize(DeviceSet):
 
     Args:
         devices: without names, a model keeps what rows share. larger: (M, 9, 1) effects of one standard deviation, m.
-        found: what a fit says of it, in standard deviations of its prior, and how well; nothing before.
+        found: what a fit says of it, in standard deviations of its prior, and how well. std: of its prior, a share.
     """
 
     devices: BoardCameras
     larger: Tensor
     found: tuple[float, float] = (0.0, 1.0)
+    std: float = BoardPrior().scale
 
     @classmethod
     def of_table(cls, data: Any, rows: Tensor) -> list[Any]:
@@ -95,13 +98,17 @@ class BoardSize(DeviceSet):
 
     def with_rows(self, other: OtherRows) -> Any:
         (again,) = [] if other.aligned is None else self.of_table(other.aligned.table, other.aligned.rows)
-        return replace(again, found=self.found)
+        return replace(again.of_std(self.std), found=self.found)
+
+    def of_std(self, std: float) -> BoardSize:
+        """With another prior."""
+        return replace(self, larger=self.larger * (std / self.std), std=std)
 
     def settled(self, fit: Settled) -> BoardSize:
         return replace(self, found=(float(fit.shifts[0]), float(fit.covariance[0, 0]) ** 0.5))
 
     def sentences(self) -> list[str]:
-        size, std = (1e6 * BoardPrior().scale * value for value in self.found)
+        size, std = (1e6 * self.std * value for value in self.found)
         return [f"board: scale {size:+.0f} +- {std:.0f} ppm against the size that its detector was told"]
 
 
@@ -126,10 +133,6 @@ class LensAndBoard(CameraErrors):
         cls, data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions] = ()
     ) -> list[Any]:
         """Cameras of the images of a table, none for other tables.
-
-        Args:
-            data: in the frame of one session. rows: (M,) numbers in the whole table. registration: of all of them.
-            sessions: of these rows, whose places were found with lengths that may be wrong.
 
         Warns:
             DiffeoCalibWarning: a board of another size than was said.
@@ -248,11 +251,7 @@ def _rms(distances: Tensor) -> float:
 
 
 def _relative_size(data: Measurements, registration: Identification, places: Tensor) -> float:
-    """How much longer the distances of a board from its camera are than a robot as described says, as a share.
-
-    Errors of places, see :func:`_places`, and scale that explain the residuals of the registration, by reweighted least
-    squares.
-    """
+    """How much longer the distances of a board are than those of a robot as described, by robust least squares."""
     geometry, slopes = registration.geometry, torch.cat([places, data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     shifts = slopes.new_zeros(slopes.shape[2])

@@ -94,13 +94,7 @@ class NewSetUp:
         same: bool = True,
         marker: str = "",
     ) -> NewRows:
-        """The rows around places, which are those where everything was before, all weights 1.
-
-        Args:
-            places: T (4, 4) from the frame of the map to that of the rows, and markers (P, 3) in the frames of their
-                tips, m. usual: noise of rows that tell coordinates.
-            deviations, marker: see :class:`NewRows`. same: whether these are the markers of the map.
-        """
+        """The rows, weights 1, around T (4, 4) from the map's frame to theirs and markers (P, 3) on their tips, m."""
         (T, markers), q = places, self.data.q
         marks = FlangePoints(robot_map(self.fitted).under(self.data.payload), markers, same=same)
         points, at = self.fitted.geodesic.with_nominal(marks).linearised_value(q)
@@ -151,9 +145,7 @@ class NewSetUp:
         variance = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # of what was measured, m^2
         total = torch.diag_embed(variance.expand_as(y))
         if numbers is not None:
-            part, size = total[numbers.rows], noise.shape[1]
-            part[:, :size, :size] = noise
-            total[numbers.rows] = part
+            total[numbers.rows, : noise.shape[1], : noise.shape[1]] = noise
         if sensor.stated:
             total = larger(total, sensor.known)
         sensor = sensor.without_known
@@ -418,7 +410,7 @@ class NewRows:
 
 
 def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: Tensor, usual: UsualNoise) -> Tensor:
-    """(M, m, m) noise of new rows in the model's frame, m^2: a block, of poses by row; their own where it is larger.
+    """(M, m, m) noise of new rows in the model's frame, m^2: what they state, and what usual rows err by beyond it.
 
     Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
     each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
@@ -427,23 +419,27 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         fitted: a fit. new, there: the rows in their own frame and in that of the model.
         T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
     """
-    bodies, total = new.bodies, usual.block.expand(len(new), -1, -1)
+    bodies, given = new.bodies, new.covariance
+    total = usual.block.new_zeros(len(new), *usual.block.shape) if given is None else turned(given, T[:3, :3].mT)
     alike = usual.factor > 0.0 and fitted.slopes is None and bool(fitted.noise.visible.all())
     now, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if alike else None
-    if now is not None and old is not None:
-        blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
-        to_modes = torch.linalg.pinv(old)
-        sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
-        eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
-        apart = eye - old @ to_modes
-        slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
-        each = (now * sizes[:, None]) @ now.mT + slack.median(0).values[:, None, None] * eye
-        total = usual.factor * block_diagonal(each)
-    return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
+    if now is None or old is None:
+        mean = mean_block(total, new.visible.repeat_interleave(3, 1))
+        return total + larger(mean, usual.block) - mean
+    blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
+    to_modes = torch.linalg.pinv(old)
+    sizes, stated = (
+        (to @ each @ to.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
+        for to, each in ((to_modes, blocks), (torch.linalg.pinv(now), own_blocks(total, now.shape[1])))
+    )
+    rest = (blocks - old @ to_modes @ blocks).diagonal(dim1=2, dim2=3).sum(2).median(0).values
+    each = (now * (usual.factor * sizes - stated).clamp(min=0.0)[:, None]) @ now.mT
+    each.diagonal(dim1=2, dim2=3).add_(usual.factor * rest[:, None] / (old.shape[2] - old.shape[3]))
+    return total + block_diagonal(each)
 
 
 def larger(first: Tensor, second: Tensor) -> Tensor:
     """A covariance (M, m, m) that is nowhere smaller than either of two."""
     values, vectors = torch.linalg.eigh(second - first)
-    total = first + (vectors * values.clamp(min=0.0)[:, None]) @ vectors.mT
+    total = first + (vectors * values.clamp(min=0.0)[..., None, :]) @ vectors.mT
     return 0.5 * (total + total.mT)

@@ -141,7 +141,6 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     """Find where device and markers are now.
 
     Args:
-        model: the old model. new: the rows.
         marker: how far the markers may be from where they were: in directions that the rows leave open, this is all
             that is known of them.
 
@@ -187,14 +186,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
 
 
 def weighed(set_up: NewSetUp, marker: str, *, opens: bool = False) -> NewRows:
-    """The new rows with their weights, and with the markers as free as is asked or as is most probable.
-
-    Rows have the noise of a typical old row, or their own where it is larger.
-
-    Args:
-        set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
-        opens: whether something may have changed among the rows.
-    """
+    """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
     fitted, record, ball = set_up.fitted, set_up.registration, None if set_up.new_ball else set_up.ball
     old = fitted_markers(fitted)
     other, earlier = old.clone(), slice(len(old) - set_up.new_ball)
@@ -282,12 +274,7 @@ def _place_of_device(
 
 
 def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
-    """Add a ball as the last marker of a map.
-
-    Args:
-        fitted: the map. ball: (3,) where it roughly is in the frame of a tip, m.
-        tip: name of the tip. deviation: of its prior around that place, m.
-    """
+    """Add a ball (3,) in the frame of a tip as the last marker of a map, with a deviation of its prior, m."""
     old, nominal = fitted.geodesic, robot_map(fitted)
     end = nominal.geometry.size
     tool = torch.cat([nominal.geometry.tool, ball[None]])

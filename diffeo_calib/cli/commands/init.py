@@ -297,18 +297,23 @@ def _commanded(robot: Path | None, sheet: guesses.Sheet) -> proposals.Source | N
 
 def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
     """The table as values of the joints, or in the convention, that explain the rows; InputError unless one does."""
-    sources, refused = dict[tuple[str | None, ...], proposals.Source](), list[InputError]()
-    for arm in (arms := _arms(robot, sheet)):
-        try:
-            with quiet():  # `fit` warns of the right reading
-                source = _read(robot, sheet, arm)
-                sources.setdefault((arm.links.dh_convention, *source.robot.joint_names), source)
-        except InputError as error:
-            refused.append(error)
+    sources, arms = dict[tuple[str | None, ...], proposals.Source](), _arms(robot, sheet)
+    refused = list[InputError]()
+    for seeks in (False, True)[len(arms) < 2 :]:  # first all as they are
+        for arm in [] if sources else arms:
+            try:
+                with quiet():  # `fit` warns of the right reading
+                    source = _read(robot, sheet, arm, seeks=seeks)
+                    sources.setdefault((arm.links.dh_convention, *source.robot.joint_names), source)
+            except InputError as error:
+                refused.append(error)
     if not sources:
-        lacking = next((arm.lacking for arm in arms if arm.lacking), ())
-        more = f" No column is named after {few(lacking, 20)}." if lacking else ""
-        raise type(refused[0])(f"{refused[0]}{more}")
+        arm = next((arm for arm in arms if arm.lacking), None)
+        more = "" if arm is None else f" No column is named after {few(arm.lacking, 20)}."
+        if arm is not None and arm.columns.how.startswith("numbered"):
+            count, most = len(arm.joints), len(arm.joints) + len(arm.lacking)
+            more = f" {count} numbered columns do not say which of {most} joints they are: name them after the joints."
+        raise type(refused[-len(arms)])(f"{refused[-len(arms)]}{more}")
     best, *_ = several = proposals.ranked(sources.values())
     if len(several) > 1 and not proposals.is_clear(several):
         got = "; ".join(
@@ -327,7 +332,7 @@ def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
     return best.into({"robot": "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"})
 
 
-def _read(robot: Path, sheet: guesses.Sheet, arm: Arm) -> proposals.Source:
+def _read(robot: Path, sheet: guesses.Sheet, arm: Arm, *, seeks: bool) -> proposals.Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
     rows = guesses.rows_in(sheet, arm.columns.names)
     tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(body.place[0]) for body in rows.bodies])
@@ -335,7 +340,8 @@ def _read(robot: Path, sheet: guesses.Sheet, arm: Arm) -> proposals.Source:
     options = {"robot": robot, **vars(arm.links), "tip": tips or None, "length": "mm", "angle": "deg"}
     source = proposals.source_of(sheet, chain, rows, **options)
     guessed = sheet.joint_columns(chain.joint_names) or [arm.columns]
-    source = proposals.with_units(proposals.with_measured(proposals.with_joint_columns(source, guessed)))
+    source = proposals.with_measured(proposals.with_joint_columns(source, guessed))
+    source = proposals.with_units(source, seeks=seeks)
     return source if tips else _with_tip(robot, source, arm)
 
 
@@ -430,6 +436,10 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
             f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20), fix=fix
         )
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms
+    words = [{SIDES.get(word, word) for name in arm.joints for word in column(name).words} for arm in arms]
+    said = [{SIDES.get(word, word) for name in arm.columns.names for word in column(name).words} for arm in arms]
+    both = set[str].intersection(*words)
+    arms = [arm for arm, own, names in zip(arms, words, said, strict=True) if (own - both) & names] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 

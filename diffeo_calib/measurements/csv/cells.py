@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import difflib
 import io
+import json
 import math
 import re
 import zipfile
@@ -168,17 +169,19 @@ def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
     MeasurementError for a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
     """
     variables = b"\0" in data and (data.startswith(MATLAB) or path.suffix.lower() == ".mat")  # version 4 has no mark
-    if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY)):
+    if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY, b"{", b"[")):
         return None
-    rows, notes = _table(path, data)
-    return csv_text(rows, sep), notes
+    table = _table(path, data)
+    return table and (csv_text(table[0], sep), table[1])
 
 
 Rows = Sequence[Sequence[object]]
 
 
 @lru_cache(maxsize=2)  # a spreadsheet of 5000 rows takes a second, and `init` reads its tables many times
-def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
+def _table(path: Path, data: bytes) -> tuple[Rows, list[str]] | None:
+    if data[:1] in (b"{", b"["):
+        return _records(data)
     if data.startswith(OLD_SHEET):
         raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
     if data.startswith(HDF5):
@@ -193,6 +196,29 @@ def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
     if names and all(name.endswith(".npy") for name in names):
         return _joined(path, _loaded(path, lambda: dict(np.load(file, allow_pickle=False))))
     return _spreadsheet(path, file)
+
+
+def _records(data: bytes) -> tuple[Rows, list[str]] | None:
+    """Objects of JSON, in a list or one a line, with a column for each number or text; None for another text."""
+    with suppress(ValueError, RecursionError):
+        records = json.loads(data) if data[:1] == b"[" else [json.loads(line) for line in data.splitlines() if line]
+        rows = [dict(_leaves("", record)) for record in records if isinstance(record, dict)]
+        if header := [*dict.fromkeys(name for row in rows for name in row)]:
+            return [header, *([_cell(row.get(name)) for name in header] for row in rows)], []
+    return None
+
+
+def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Numbers and texts of an object, by names that tell where they stand in it."""
+    if isinstance(value, dict):
+        parts = [(f"{name}_{key}" if name else str(key), part) for key, part in value.items()]
+    elif isinstance(value, list):
+        parts = [*zip(names_of(name, (len(value),)), value, strict=True)]
+    else:
+        yield name, value
+        return
+    for part_name, part in parts:
+        yield from _leaves(part_name, part)
 
 
 def _no_table(path: Path, got: str, fix: str) -> MeasurementError:

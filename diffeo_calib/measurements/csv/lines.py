@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from diffeo_calib.common.errors import MeasurementError, few, listed
-from diffeo_calib.common.files import WholeFile
+from diffeo_calib.common.files import WholeFile, decoded
 from diffeo_calib.measurements.csv.cells import MARKS, as_text, csv_text, names_of, number, repeated
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
@@ -29,8 +29,7 @@ Cells = Sequence[Sequence[float | str]]
 Column = Sequence[str] | Sequence[float]
 
 HEAD = 200  # lines among which the header is
-NO_TABLES = {".json", ".yaml", ".yml", ".xml"}
-QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"  # quotation marks, dashes and the like in cp1252
+NO_TABLES = {".json", ".yaml", ".yml", ".xml", ".ls", ".src", ".mod", ".jbi"}  # the last four: programs of robots
 AT_ONCE = 1 << 13  # bytes by which a file is judged
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
@@ -202,25 +201,19 @@ def _text(path: Path, sep: str) -> tuple[str, list[str], str]:
     except OSError as error:
         what = f"file '{path}' cannot be read ({error.strerror})"
         raise MeasurementError.of(what, fix="pass the name of a readable file") from error
-    if path.suffix.lower() in NO_TABLES:
-        what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
-        raise MeasurementError.of(what, expected="CSV, a spreadsheet or arrays", got=path.suffix, fix=fix)
     sha256 = hashlib.sha256(data).hexdigest()
     if data.startswith(WIDE):
         return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"], sha256
     if (sheet := as_text(path, data, sep)) is not None:
         return *sheet, sha256
+    if path.suffix.lower() in NO_TABLES:
+        what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
+        raise MeasurementError.of(what, expected="CSV, a spreadsheet, arrays or JSON records", got=path.suffix, fix=fix)
     if b"\0" in data:
         what, fix = f"file '{path}' is no text but binary", "export the table as CSV"
         raise MeasurementError.of(what, expected="a CSV file", fix=fix)
-    try:
-        return data.decode("utf-8-sig"), [], sha256
-    except UnicodeDecodeError:  # Chinese has pairs of high bytes, usual ones below 0xD8; Japanese begins with others
-        words = [word for word in re.findall(rb"[\x80-\xff]+", data) if word.strip(QUOTES)]
-        pairs = words and all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words) and min(words)[0] < 0xD8
-        japanese = 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words)
-        page = "gb18030" if pairs else "cp932" if japanese else "cp1252"
-        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"], sha256
+    text, page = decoded(data)
+    return text, [f"text in {page}, not UTF-8"] * bool(page), sha256
 
 
 class TextTable(NamedTuple):
@@ -263,7 +256,10 @@ def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[i
     words = [
         (k, cells)
         for k, cells in before
-        if len(cells) in sizes and not _is_units(cells) and (_counted(cells) or not any(map(_value, cells)))
+        if len(cells) in sizes
+        and sum(map(bool, cells)) > (len(cells) > 1)  # no title in the first cell alone
+        and not _is_units(cells)
+        and (_counted(cells) or not any(map(_value, cells)))
     ]
     for k, cells in words:
         if all(cells[: sizes[0]]) and not repeated(cells[: sizes[0]]):
