@@ -149,3 +149,16 @@ def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
 def whole(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
     """Columns that have all of the labels."""
     return (group for group in groups(names, labels) if len(group.names) == len(labels))
+
+
+def mixed_names(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> dict[str, str]:
+    """Columns that are named after joints in part or by the first letters (x_axis, c, az), or as DH tables do (d3)."""
+    there = {column(name).plain: name for name in reversed(columns)}
+    starts = {text: [label for label in bare if label.startswith(text)] for text in there if len(text) > 1}
+    names = dict[str, str]()
+    for k, (whole_name, label) in enumerate(zip(full, bare, strict=True)):
+        texts = whole_name, label, *(f"{sign}{k + 1}" for sign in ("θ", "theta", "d"))
+        short = (text for text, labels in starts.items() if labels == [label])
+        if text := next((text for text in texts if text in there), next(short, "")):
+            names[whole_name] = there[text]
+    return names if len({*names.values()}) == len(full) else {}

@@ -33,6 +33,19 @@ NOTE = "Text to keep in the model file, such as a serial number."
 MODEL = "Model file written by `fit`."
 MEASURED_TOOL = "; behind measured: in the measured frame of a model of poses, which is better known"
 OLD = "Model file of an earlier calibration."
+REASONS = {
+    **dict.fromkeys(("angle", "rotation_angle", "decimal"), "the same"),
+    "joint_length": "the same: the slides are in another unit",
+    "camera_on_tool": "as of length; else the board is on the tool",
+    "rotation": "by their names; without these three lines positions alone are calibrated",
+    "dh_convention": "the convention with which it explains the rows",
+    "base": "root of the URDF",
+    "tip": "leaves after which the columns are named",
+    "places": "the measured places",
+    "output": "the model",
+    "report": "the report",
+}
+"""Of options of `fit` that `init` proposes, by default; "the same" as of the option before."""
 
 
 class Command(Options):

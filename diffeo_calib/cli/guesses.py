@@ -16,7 +16,7 @@ import numpy as np
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, whole
+from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, mixed_names, whole
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
@@ -36,10 +36,7 @@ LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 DRIFT = "a drift with it is sought, and kept where left-out rows prove it"
 NAMED = {
     "session": ("session setup station anchor device plane aufstellung", "the device, or its set-up, of every row"),
-    "payload": (
-        "payload mass load nutzlast traglast carga 负载 負荷",
-        "the known mass that the robot carried",
-    ),
+    "payload": ("payload mass load nutzlast traglast carga 负载 負荷", "the known mass that the robot carried"),
     "time": ("time times timeh timestamp seconds minutes hours hour zeit zeits tiempo temps", DRIFT),
     "temperature": ("temperature temp temperaturec tempc temperatur temperatura 温度", DRIFT),
 }
@@ -48,7 +45,6 @@ JOINTS = "q0", "q1"
 """First names of four numbers that are joint values, rather than a quaternion, where they stand before a place."""
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
-DH_SIGNS = "θ", "theta", "d"
 ROTATIONS = (
     *(("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"), ("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")),
     *(tuple(f"{row}{k}" for row in index for k in index) for index in ("012", "123")),  # a matrix by rows
@@ -204,21 +200,8 @@ def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tupl
     series += [["", *digits[:-1]] for digits in series if n > 1]  # the first joint is a rail
     labels += [("numbered in the order of the URDF's joints", digits) for digits in series]
     named = [(naming, how, group) for how, naming in labels for group in groups(columns, naming)]
-    mixed = Group((), (), _mixed(columns, full, bare))
+    mixed = Group((), (), mixed_names(columns, full, bare))
     return iter([(full, usual, mixed)] * bool(mixed.names) + named)
-
-
-def _mixed(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> dict[str, str]:
-    """Columns that are named after joints in part or by the first letters (x_axis, c, az), or as DH tables do (d3)."""
-    there = {column(name).plain: name for name in reversed(columns)}
-    starts = {text: [label for label in bare if label.startswith(text)] for text in there if len(text) > 1}
-    names = dict[str, str]()
-    for k, (whole_name, label) in enumerate(zip(full, bare, strict=True)):
-        texts = whole_name, label, *(f"{sign}{k + 1}" for sign in DH_SIGNS)
-        short = (text for text, labels in starts.items() if labels == [label])
-        if text := next((text for text in texts if text in there), next(short, "")):
-            names[whole_name] = there[text]
-    return names if len({*names.values()}) == len(full) else {}
 
 
 def _is_external(name: str) -> bool:

@@ -27,7 +27,7 @@ from diffeo_calib.calibration.identification.registration import register_socket
 from diffeo_calib.calibration.placing.readings import images_error, resting_rows, rough_error
 from diffeo_calib.cli import guesses
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.declarations import FitOptions
+from diffeo_calib.cli.declarations import REASONS, FitOptions
 from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.cli.tables import MeasuredTable, described
 from diffeo_calib.common.device import HOST
@@ -57,19 +57,6 @@ UNITS = "length", "angle", "joint_length", "camera_on_tool"
 """Options that :meth:`Source.in_units` tries, beside how a place is a distance and two angles."""
 COLUMNS = "joints", "robot_pose", "position", "marker", "socket", "rotation", "std", "reading", "by", *guesses.NAMED
 """Options that name columns."""
-REASONS = {
-    **dict.fromkeys(("angle", "rotation_angle", "decimal"), "the same"),
-    "joint_length": "the same: the slides are in another unit",
-    "camera_on_tool": "as of length; else the board is on the tool",
-    "rotation": "by their names; without these three lines positions alone are calibrated",
-    "dh_convention": "the convention with which it explains the rows",
-    "base": "root of the URDF",
-    "tip": "leaves after which the columns are named",
-    "places": "the measured places",
-    "output": "the model",
-    "report": "the report",
-}
-"""Of options, by default; "the same" as of the option before."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ for program, count in ((kills, "4"), (campaign_faults, "1")):
     program.harness.guarded(program.program)
 """
 """With small tables and given scales: whether files are whole does not depend on them."""
-FOLDERS = [Path(__file__).parents[2] / "benchmarks" / "robustness", Path(__file__).parents[1] / "banks"]
+TESTS, BENCHMARKS = Path(__file__).parents[1], Path(__file__).parents[2] / "benchmarks"
+FOLDERS = [BENCHMARKS / "robustness", BENCHMARKS / "real_robots", TESTS / "banks"]
 
 pytestmark = pytest.mark.slow
 

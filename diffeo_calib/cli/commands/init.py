@@ -439,7 +439,7 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
     words = [{SIDES.get(word, word) for name in arm.joints for word in column(name).words} for arm in arms]
     said = [{SIDES.get(word, word) for name in arm.columns.names for word in column(name).words} for arm in arms]
     both = set[str].intersection(*words)
-    arms = [arm for arm, own, names in zip(arms, words, said, strict=True) if (own - both) & names] or arms
+    arms = [arm for arm, named, names in zip(arms, words, said, strict=True) if (named - both) & names] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
 
