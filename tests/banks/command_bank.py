@@ -22,7 +22,6 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 PROGRAM = "import sys; sys.argv[0] = 'diffeo-calib'; from diffeo_calib.__main__ import main; main()"
 POSITION = "mx,my,mz"
 TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
-ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
 FORMAT = TableFormat("mm", "deg", ";", ",")
 """That of TABLE."""
 NOTE = "arm 7 [left], spring check; serial 4711 é"

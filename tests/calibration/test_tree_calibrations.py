@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from numbers_bank import inside, rms
+from numbers_bank import rms
 from product_bank import usual_scales
 from simulated_body import HANDS, SimulatedUpperBody
 from table_bank import refused
@@ -37,11 +37,6 @@ def model(body: SimulatedUpperBody, data: dc.Measurements) -> dc.CalibratedKinem
 @pytest.fixture(scope="module")
 def q(body: SimulatedUpperBody) -> Tensor:
     return body.sample(100, seed=9)
-
-
-def test_deviations_hold(body: SimulatedUpperBody, model: dc.CalibratedKinematics, q: Tensor) -> None:
-    mean, covariance = model.predict(q, noise=False)
-    assert inside(mean - body.true_points(q), covariance) > 0.85
 
 
 @pytest.mark.filterwarnings("ignore:errors seem to depend")  # of the chain without the other arm

@@ -117,9 +117,7 @@ def test_same_values_as_the_torch_model(name: str, waves: bool, tmp_path: Path) 
     assert torch.equal(again(q), model(q))
     assert found.joint_names == chain.joint_names
     np.testing.assert_array_equal(found.limits, chain.limits.numpy())
-    np.testing.assert_allclose(found(q), model.map.deformation(q).unflatten(1, (-1, 3)), rtol=0, atol=1e-12)
-    jacobian = model.map.deformation.jacobian(q).unflatten(1, (-1, 3))
-    np.testing.assert_allclose(found.jacobian(q), jacobian, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.jacobian(q), model.jacobian(q), rtol=0, atol=1e-9)
     for frame in ("base", "measuring"):
         np.testing.assert_allclose(found.tool_poses(q, frame=frame), model.tool_poses(q, frame=frame), atol=1e-12)
         slopes = model.tool_jacobian(q, [0.1, 0.2, 0.3], frame)

@@ -35,16 +35,6 @@ def same(found: Tensor, expected: Tensor, atol: float = 2e-12) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("name", ["arm", "mimic slides"])
-def test_points_and_tool_poses_of_any_number_of_rows(name: str) -> None:
-    model = made(name, markers=2)
-    for q in (queries(model)[:1], queries(model, 40) + 7.0):
-        same(TorchProgram(model)(q), model.map.deformation(q).unflatten(1, (2, 3)))
-        for tool, frame in ((None, "base"), (TOOL, "measuring")):
-            found = TorchProgram(model, "tool_poses", tool=tool, frame=frame)(q)
-            same(found, model.tool_poses(q, tool, frame))
-
-
 def test_derivatives_plain_maps_and_single_precision() -> None:
     """Derivatives at control points too; single precision is good to micrometres."""
     for name, transform in (("mimic slides", jacrev), ("one joint", jacfwd)):
@@ -74,14 +64,19 @@ def test_a_pose_in_closed_form_is_that_of_least_squares() -> None:
 
 @pytest.mark.filterwarnings("ignore")  # torch's own: it deprecates this, and mentions constants
 def test_jit_trace_for_any_number_of_rows() -> None:
-    model = made("one joint", markers=3)
-    for output in ("points", "poses", "tool_poses"):
-        program = TorchProgram(model, output)
-        if output == "poses":
-            same(program(queries(model)), model.poses(queries(model)))
-        traced = torch.jit.trace(program, (queries(model),), check_trace=False)
-        for q in (queries(model)[:1], queries(model, 50)):
-            same(traced(q), program(q))  # pyright: ignore[reportCallIssue]
+    """And of angles beyond a turn; points by both programs: test_evaluators.py."""
+    model = made("mimic slides", markers=3)
+    there = {"output": "tool_poses", "tool": TOOL, "frame": "measuring"}
+    cases: list[tuple[dict[str, Any], Any]] = [
+        ({}, model),
+        ({"output": "poses"}, model.poses),
+        ({"output": "tool_poses"}, model.tool_poses),
+        (there, lambda q: model.tool_poses(q, TOOL, "measuring")),
+    ]
+    for options, expected in cases:
+        traced: Any = torch.jit.trace(TorchProgram(model, **options), (queries(model),), check_trace=False)
+        for q in (queries(model)[:1], queries(model, 50) + 7.0):
+            same(traced(q), expected(q))
 
 
 def test_refusals() -> None:
