@@ -18,7 +18,7 @@ from kind_bank import kind_named
 from numbers_bank import drawn, normal, rms, tensor
 from product_bank import simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
-from table_bank import refused, warned
+from table_bank import warned
 from tangent_bank import Setting, covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -30,9 +30,7 @@ from diffeo_calib.calibration.diagnostics.judge import changes
 from diffeo_calib.calibration.placing.placement import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.devices import Hypothesis
@@ -396,27 +394,6 @@ def test_beyond_its_rows_a_drift_stays_as_at_the_end(drifted: Any) -> None:
     for end in known.ends["time"]:  # the rows of the fit reach them
         there = drifted[1].with_covariates(time=torch.full((60,), end, dtype=torch.float64))
         assert not [line for line in known.in_rows(there) if "outside" in line]
-
-
-def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:
-    (q, points), columns = DRIFTING.measure(12, seed=1), {"time": hours(12), "temperature": 20.0 + hours(12)}
-    data: Any = dc.Measurements(q, points, DRIFTING.nominal.joint_names).with_covariates(**columns)
-    both: Any = dc.Observations.joined([data, readings(DRIFTING, "height", 12).with_covariates(**columns)])
-    for rows in (data, both):
-        form = write_measurements(tmp_path / "t.csv", rows, TableFormat("mm", "deg", time="hour"))
-        read: Any = read_observations(tmp_path / "t.csv", form)
-        assert read.covariate_names == ("time", "temperature")
-        assert_close(read.rows([3, 1]).covariates, rows.covariates[[3, 1]], rtol=1e-12, atol=0)
-
-
-def test_columns_that_cannot_be() -> None:
-    q, points = DRIFTING.measure(12, seed=1)
-    table = dc.Measurements(q, points)
-    refused(
-        ("temperature", lambda: table.with_covariates(temperature=[1.0, 2.0])),
-        ("time", lambda: table.with_covariates(time=[float("nan")] * 12)),
-        ("covariate", lambda: dc.Measurements.joined([table, table.with_covariates(time=hours(12))])),
-    )
 
 
 @pytest.mark.parametrize(("left", "better"), [([0.9] * 100, True), ([1.0] * 99 + [0.0], False), ([0.99] * 100, False)])

@@ -83,6 +83,7 @@ KINDS: dict[str, Any] = {
     "positions": positions,
     "positions with deviations": lambda: positions(1e-4),
     "sessions": lambda: positions().with_sessions(["mon", "tue", "mon", "tue", "tue"]),
+    "drift": lambda: lengths().with_covariates(time=values(5), temperature=20.0 + values(5)),
     "payloads": lambda: positions().with_payload([0.0, 1.0, 2.0, 0.0, 0.5]),
     "hidden markers on tips": markers,
     "poses": poses,
@@ -100,6 +101,9 @@ KINDS: dict[str, Any] = {
     "all": lambda: Observations.joined([positions(), lengths(), resting(), heights(), images(), FURTHER]),
     "all in sessions": lambda: Observations.joined([positions().with_sessions(list("uvuvu")), images(), resting()]),
     "boards": boards,
+    "several kinds of a drift": lambda: Observations.joined(
+        [own.with_covariates(time=values(len(own))) for own in (positions(), heights())]
+    ),
     "laden": lambda: Observations.joined([poses(), heights()]).with_payload(torch.arange(9.0)),
 }
 
@@ -130,6 +134,7 @@ def assert_same(found: Any, wanted: Any) -> None:
         *(("poses on tips", replace(DEGREES, convention=own, rotation_angle="rad")) for own in ("matrix", "ZYX")),
         *(("poses", replace(SI, convention=own)) for own in ("quat_xyzw", "quat_wxyz")),
         ("boards", replace(DEGREES, camera_on_tool=True)),
+        ("drift", replace(DEGREES, time="hour")),
         *(("positions", replace(DEGREES, spherical=own)) for own in ("elevation_rad", "zenith_clockwise_gon")),
     ],
 )
@@ -137,6 +142,7 @@ def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: P
     data, path = KINDS[kind](), tmp_path / "t.csv"
     again = read_observations(path, write_measurements(path, data, table))
     assert_same(again, data)
+    assert again.covariate_names == data.covariate_names
     assert again.line_numbers.tolist() == list(range(2, 2 + len(data)))
     assert len(again.sha256) == 64
     assert again.rows([0]).sha256 == again.sha256, "of the file"

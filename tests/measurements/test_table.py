@@ -124,6 +124,9 @@ def test_set_ups_and_loads_of_rows() -> None:
         (lambda: posed.with_sessions(names, remounted=True), "mounted anew: expected positions, got poses"),
         (lambda: data.with_payload([1, 2, -3, 4, 5]), "`payload`, row 2: expected a mass of 0 or more, got -3"),
         (lambda: data.with_payload(-1.0), "`payload`: expected a mass of 0 or more, got -1"),
+        (lambda: data.with_covariates(temperature=[1.0, 2.0]), "temperature"),
+        (lambda: data.with_covariates(time=[nan] * 5), "time"),
+        (lambda: Measurements.joined([data, data.with_covariates(time=range(5))]), "covariate"),
         (lambda: Readings.distances(data.q, 1.0, offset_std=-1.0), "`offset_std`: expected 0 or more, got -1.0"),
         (lambda: Readings.distances(data.q, [1, 1, 0, 1, 1]), "`lengths`: expected above 0, got 0 m in row 2"),
     ):
