@@ -277,6 +277,6 @@ def share_places(kind: Kind, module: str, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(f"diffeo_calib.calibration.recalibration.{module}.place_again", place_again)
 
 
-def table_rows(path: Path) -> list[dict[str, str]]:
+def table_rows(path: Path, sep: str = ",") -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+        return list(csv.DictReader(file, delimiter=sep))

@@ -1,6 +1,5 @@
 """`fit`, `demo`, `plan`, `recalibrate` and `export`: what they print and write, as the functions of Python do."""
 
-import csv
 import json
 import math
 import re
@@ -12,6 +11,7 @@ import pytest
 import torch
 from command_bank import FORMAT, POSITION, STAGES, TABLE, Command, Outcome, Site
 from export_bank import own_poses
+from kind_bank import table_rows
 from product_bank import Case, simulated
 from torch import Tensor
 
@@ -92,9 +92,7 @@ UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 
 
 def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
-    with path.open(newline="") as file:
-        ranks = [int(row["rank"]) for row in csv.DictReader(file, delimiter=";")]
-    return read_joints(path, replace(FORMAT, joints=robot)), ranks
+    return read_joints(path, replace(FORMAT, joints=robot)), [int(row["rank"]) for row in table_rows(path, ";")]
 
 
 def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> None:

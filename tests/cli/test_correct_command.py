@@ -2,6 +2,7 @@
 
 import csv
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 from command_bank import VALIDATOR, Command
 from deformation_bank import model_of
+from kind_bank import table_rows
 from product_bank import Case
 from table_bank import held
 from torch import Tensor
@@ -26,9 +28,7 @@ TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in d
 Rows = list[dict[str, str]]
 
 
-def read(path: Path, sep: str = ";") -> Rows:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file, delimiter=sep))
+read = partial(table_rows, sep=";")
 
 
 def write(path: Path, rows: Rows) -> None:
@@ -200,12 +200,12 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
     assert [miss is None for miss in misses["right"]["miss_m"]] == empty
     assert misses["left"]["angle_miss_deg"] is None
     assert "6 rows: 6 reached" in done.out
-    assert [row["miss_right_mm"] == "" for row in read(output, ",")] == empty
+    assert [row["miss_right_mm"] == "" for row in table_rows(output)] == empty
     done = command.ran(*given)
     assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
     goals = arms.robot(torch.from_numpy(q)) @ torch.stack([tool_transform(place) for place in PLACES])
     expected = dc.compensate(arms, goals, q, tool=PLACES, bound=np.radians(20.0))
-    after = read(output, ",")
+    after = table_rows(output)
     np.testing.assert_allclose(table(after, names), expected.q.numpy(), rtol=0, atol=1e-12)
     for k, hand in enumerate(HANDS):
         found = table(after, [f"miss_{hand}_mm", f"angle_miss_{hand}_rad"])

@@ -9,8 +9,8 @@ import pytest
 import torch
 from export_bank import rigid_model, wrong
 from kind_bank import kind_named, table_rows
+from numbers_bank import drawn, rms
 from product_bank import Case
-from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import with_joint_offsets
@@ -21,10 +21,6 @@ from diffeo_calib.interop.tables import correction_tables, write_correction_tabl
 from diffeo_calib.robots import Geometry
 
 
-def rms(points: Tensor, others: Tensor) -> float:
-    return float((points - others).square().sum(-1).mean().sqrt())
-
-
 def test_a_rigid_model_is_found_again(arm: Case) -> None:
     """Nothing is lost, at other configurations too; exact joint errors beat those that are estimated of 60 poses."""
     truth, other = (wrong(arm.robot, size=size).joint_errors for size in (1e-3, 2e-3))
@@ -33,7 +29,7 @@ def test_a_rigid_model_is_found_again(arm: Case) -> None:
         found = rigid_kinematics(dc.CalibratedKinematics(model.robot, model.map, rigid_errors=errors))
         assert (found.how, set(found.validated)) == (how, ways)
         assert found.validated[how] == min(found.validated.values()) < 1e-7
-        assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
+        assert rms(found.geometry.points(arm.test.q) - model(arm.test.q)) < 2e-8
         assert found.rms <= found.largest < 1e-8
 
 
@@ -42,13 +38,13 @@ def test_the_projection_is_a_minimum_and_its_numbers_are_those_of_the_geometry(a
     model, q, y = arm.model, arm.model.configurations, arm.model(arm.model.configurations)
     found = rigid_kinematics(dc.CalibratedKinematics(model.robot, model.map, model.summary))
     assert found.how == PROJECTION
-    assert found.rms == pytest.approx(rms(found.geometry.points(q), y), rel=1e-9)
+    assert found.rms == pytest.approx(rms(found.geometry.points(q) - y), rel=1e-9)
     assert found.largest == pytest.approx(float((found.geometry.points(q) - y).norm(dim=-1).max()), rel=1e-9)
     assert found.rms < found.validated[PROJECTION] < with_errors(model, None).rms
     generator = torch.Generator().manual_seed(0)
     for _ in range(20):
         theta = 2e-5 * torch.randn(found.geometry.size, dtype=torch.float64, generator=generator)
-        assert rms(found.geometry.points(q, theta), y) > found.rms
+        assert rms(found.geometry.points(q, theta) - y) > found.rms
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.2])
@@ -59,9 +55,9 @@ def test_joint_offsets_are_found_again(size: float, arm: Case) -> None:
     found = best_joint_offsets(model)
     torch.testing.assert_close(found.offsets, offsets, rtol=0, atol=1e-7)
     q = arm.test.q
-    assert rms(found.rigid.geometry.points(q), model(q)) < 1e-6
+    assert rms(found.rigid.geometry.points(q) - model(q)) < 1e-6
     nominal = replace(found.rigid.geometry, joint_errors=Geometry.nominal(arm.robot).joint_errors)
-    assert rms(nominal.points(q + found.offsets), model(q)) < 1e-6
+    assert rms(nominal.points(q + found.offsets) - model(q)) < 1e-6
 
 
 @pytest.mark.slow
@@ -70,9 +66,9 @@ def test_distances_hold_where_no_row_is(name: str) -> None:
     """Rows in sockets and at one wire show little of the robot: what is said is of the joint ranges."""
     model = kind_named(name).model
     low, high = model.configurations.amin(0), model.configurations.amax(0)
-    q = low + (high - low) * torch.rand(400, len(low), dtype=low.dtype, generator=torch.Generator().manual_seed(5))
+    q = low + (high - low) * drawn(400, len(low), seed=5)
     found = rigid_kinematics(model)
-    assert rms(found.geometry.points(q), model(q).detach()) == pytest.approx(found.validated[found.how], rel=0.15)
+    assert rms(found.geometry.points(q) - model(q)) == pytest.approx(found.validated[found.how], rel=0.15)
 
 
 @pytest.mark.slow
@@ -80,7 +76,7 @@ def test_on_a_real_robot(ur10_150: Case) -> None:
     """Held-out rows of the UR10, 150 rows fitted: 0.40 mm, where the model's geometry left alone leaves 0.6."""
     model, test = ur10_150.model, ur10_150.test
     rigid = rigid_kinematics(model)
-    found, alone = (rms(geometry.points(test.q), test.points) for geometry in (rigid.geometry, model.geometry))
+    found, alone = (rms(geometry.points(test.q) - test.points) for geometry in (rigid.geometry, model.geometry))
     assert found < 0.43e-3 < alone
     assert rigid.validated[rigid.how] == pytest.approx(found, rel=0.15)
 

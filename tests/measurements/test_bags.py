@@ -1,6 +1,5 @@
 """Bags of ROS as tables of stops, and as images with their joint values. Skipped without rosbags."""
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from bag_bank import JOINTS, PICTURES, PLACES, Bag, place, standing
 from command_bank import Command
+from kind_bank import table_rows
 
 from diffeo_calib.measurements.bags import read_images
 
@@ -42,8 +42,7 @@ class Recorder:
         path = bag.write(self.folder / f"bag{id(bag)}") if isinstance(bag, Bag) else bag
         done = self.command("record", path, seen, "-o", self.folder / "run.csv", *more)
         assert done.code == 0, done.err
-        with (self.folder / "run.csv").open(newline="", encoding="utf-8") as file:
-            return done, list(csv.DictReader(file))
+        return done, table_rows(self.folder / "run.csv")
 
     def refused(self, path: Path, seen: str, *words: str, more: Sequence[str] = ()) -> None:
         done = self.command("record", path, seen, "-o", self.folder / "no.csv", *more)

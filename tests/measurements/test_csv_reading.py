@@ -143,14 +143,10 @@ def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
         read(separated(",", damaged), **FORMAT)
 
 
-def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) -> None:
+def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
+    """And units: tests/measurements/test_csv_writing.py."""
     robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
     how: dict[str, Any] = {"length": "mm", "angle": "deg"}
-    in_mm, in_m = {"kinds": ["prismatic", "continuous"]}, {"kinds": robot.kinds, "joint_length": "m"}
-    for slide, own in ((250, in_mm), (0.25, in_m)):
-        data = read(HEADER + f"{slide},90,1000,0,500\n", **own, **how)
-        assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
-        assert data.points.tolist() == [[[1.0, 0.0, 0.5]]]
     (tmp_path / "table.csv").write_text(HEADER + "250,90,1000,0,500\n")
     data = read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS, **how)  # pyright: ignore
     assert data.joint_names == robot.joint_names

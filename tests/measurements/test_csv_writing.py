@@ -1,6 +1,5 @@
 """Tables of every kind, and of several: what is written is read back, and columns have the names that are said."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from kind_bank import table_rows
 from numbers_bank import normal as values
 from product_bank import erring, sliding_robot
 from table_bank import POSITION, held, in_order, random_poses, read_table, some
@@ -160,7 +160,7 @@ def test_slides_keep_their_unit(units: tuple[str, str], tmp_path: Path) -> None:
     assert_close((again.q, again.points), (data.q, data.points), rtol=1e-14, atol=1e-15)
     write_predictions(path, [(data.q, data.points, 1e-3 * data.points)], table, joints=robot)
     assert_close(read_joints(path, of_robot(table, robot)), data.q, rtol=1e-14, atol=1e-15)
-    first = next(csv.DictReader(path.read_text().splitlines()))
+    first, *_ = table_rows(path)
     scale = {"m": 1.0, "mm": 1e3}
     assert float(first["slide"]) == pytest.approx(scale[units[1]] * float(data.q[0, 2]))
     assert float(first["x"]) == pytest.approx(scale[units[0]] * float(data.points[0, 0, 0]))

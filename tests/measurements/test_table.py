@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numbers_bank import normal as values
 from table_bank import held, in_order, random_poses, says, some
@@ -284,6 +284,7 @@ def repeated_measurements(draw: st.DrawFn) -> Measurements:
     return Measurements(q, points)
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)  # of a busy machine
 @given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(0, 5))
 def test_splits_cut_no_group(data: Measurements, fraction: float, seed: int) -> None:
     row, group = (data.points[:, 0, axis].int().tolist() for axis in (0, 1))

@@ -7,9 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from eulerian_bank import CORRECTED, P0, SWITCHES, deformed, momenta, name, small_problem
 from listings import Descent, lr_calibration
-from math_bank import few_points, naive_rk4, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
+from math_bank import (
+    K_V,
+    K_W,
+    few_points,
+    naive_rk4,
+    normal,
+    planar_two_markers,
+    rr_problem,
+    tensor,
+    two_marker_problem,
+    uniform,
+)
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -17,9 +27,35 @@ from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import slope, tangent
 from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.nominal import as_nominal
 from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem
 from diffeo_calib.robots import elastic_rr
+
+SWITCHES = [Eulerian(*flags) for flags in product((False, True), repeat=3)]
+CORRECTED = Eulerian(printed_jacobian=False)
+
+
+def name(equations: Eulerian) -> str:
+    return "-".join(s for s, on in vars(equations).items() if on) or "corrected"
+
+
+def momenta(p0: Tensor) -> Momenta:
+    return Momenta(p0.new_zeros(0, 2), p0, p0.new_zeros(0))
+
+
+def small_problem(count: int = 7) -> dc.Problem:
+    x = uniform(count, 2, seed=3)
+    return dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=0.1)
+
+
+def deformed(
+    p0: Tensor, equations: Eulerian | None = None, integrator: Integrator | None = None
+) -> EulerianDeformation:
+    return EulerianProblem(small_problem(len(p0)), equations).deform(momenta(p0), integrator or dc.RK4(2))
+
+
+P0 = 0.03 * normal(7, 2, seed=5)
 
 
 def k_v(d: np.ndarray) -> float:

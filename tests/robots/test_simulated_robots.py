@@ -7,18 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from math_bank import uniform
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import SimulatedArm, elastic_rr
 from diffeo_calib.robots.simulated_arm import COMPLIANCE, PAYLOAD_CENTRE
 
 
-def uniform(count: int) -> torch.Tensor:
-    return 2 * pi * torch.rand(count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - pi
-
-
 def test_error_of_the_nominal_model() -> None:
-    x = uniform(100_000)
+    x = uniform(100_000, 2)
     error = (elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1)
     assert float(error.mean()) == pytest.approx(0.108, abs=5e-4)
     assert float(error.max()) == pytest.approx(0.184, abs=5e-4)
