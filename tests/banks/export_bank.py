@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from deformation_bank import geometry_of
-from robots_bank import draw
+from robots_bank import FOLDER, draw
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -17,43 +17,7 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots import Chain, Geometry
 
-UGLY = """<?xml version='1.0' encoding="utf-8"?>
-<!-- <joint name="pan" type="revolute"><origin xyz="9 9 9" rpy="9 9 9"/></joint> -->
-<!DOCTYPE robot>
-<robot name="Grüße &amp; más" xmlns:xacro="http://ros.org/wiki/xacro">
-\t<xacro:property name="pi" value="3.1415"/>
-  <link name="floor"><visual><origin xyz="1 1 1" rpy='0 0 0'/><geometry><mesh filename="package://none/a.dae"/>
-    </geometry></visual></link><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/>
-  <link name="hand"/>  <link name="finger"/>
-  <gazebo><joint name="pan"><origin xyz="8 8 8"/></joint><![CDATA[<joint name="pan"><origin xyz="7 7 7"/>]]></gazebo>
-  <joint   type='revolute'
-           name='pan' >
-      <parent link='floor'/> <child link='a'/>
-      <!-- <origin xyz="6 6 6"/> -->
-      <origin
-         rpy = '0.0   1.57079632679 0'
-         xyz = "0 0
-                0.3" />
-      <axis xyz="0 0 1"/><limit lower="-3" upper='3' effort="1" velocity="1"/>
-  </joint>
-  <joint name="lift" type="continuous">
-     <parent link="a"/><child link="b"/><axis xyz="0 2 0"/></joint>
-  <joint name="pla>te" type="fixed">
-    <origin rpy="0 0 0.5" xyz="0.1 0 0"></origin><parent link="b"/><child link="c"/></joint>
-  <joint name="slide" type="prismatic">
-    <parent link="c"/><child link="d"/><origin/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
-  </joint>
-  <joint name="turn" type="revolute">
-    <origin xyz="0.2 0 0"/><parent link="d"/><child link="e"/><axis xyz="0 -1 0"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/>
-    <!-- a second origin, which readers ignore --><origin xyz="5 5 5"/></joint>
-  <joint name="flange" type="fixed"><origin xyz="0 0 0.1" rpy="0 3.14159265358979 0"/>
-     <parent link="e"/><child link="hand"/></joint>
-  <joint name="grip" type="prismatic"><origin xyz="0 0 0.01"/><parent link="hand"/><child link="finger"/>
-     <axis xyz="0 1 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
-</robot>
-<!-- end -->
-"""
+UGLY = (FOLDER / "ugly.urdf").read_bytes().decode()
 UGLY_ENDS = ("floor", "hand")
 
 

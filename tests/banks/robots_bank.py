@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import inf, pi
+from pathlib import Path
 
 import pytest
 import torch
@@ -59,48 +60,10 @@ CHAINS = {
 }
 every_chain = pytest.mark.parametrize("chain", CHAINS.values(), ids=CHAINS.keys())
 
-# Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must be ignored.
-CROOKED = """<robot name="crooked">
-  <link name="world"/><link name="root"/><link name="a"/><link name="b"/><link name="plate"/>
-  <link name="c"/><link name="d"/><link name="end"/><link name="finger"/>
-  <joint name="stand" type="fixed"><parent link="world"/><child link="root"/>
-    <origin xyz="1 -2 0.5" rpy="0.3 -0.7 2.1"/></joint>
-  <joint name="slide" type="prismatic"><parent link="root"/><child link="a"/>
-    <origin xyz="0.1 0.2 0.3" rpy="1 2 3"/><axis xyz="0.36 0.48 0.8"/>
-    <limit lower="-0.4" upper="0.7" effort="1" velocity="1"/></joint>
-  <joint name="turn" type="revolute"><parent link="a"/><child link="b"/>
-    <origin xyz="-0.2 0.05 0.4" rpy="-0.4 0.9 0.2"/><axis xyz="-0.48 0.6 0.64"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="plate_mount" type="fixed"><parent link="b"/><child link="plate"/>
-    <origin xyz="0.3 0.1 -0.2" rpy="0.5 0.6 -0.7"/><axis xyz="0 0 0"/></joint>
-  <joint name="spin" type="continuous"><parent link="plate"/><child link="c"/>
-    <origin xyz="0 0 0.2" rpy="0 0.1 0"/><axis xyz="0 -1 0"/></joint>
-  <joint name="lift" type="prismatic"><parent link="c"/><child link="d"/><axis xyz="0 0 1"/>
-    <limit lower="0" upper="0.2" effort="1" velocity="1"/></joint>
-  <joint name="tool" type="fixed"><parent link="d"/><child link="end"/><origin xyz="0 0.05 0.1" rpy="0.2 0 0"/></joint>
-  <joint name="grip" type="revolute"><parent link="d"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-</robot>"""
-LIFT = """<robot name="lift">
-  <link name="floor"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/>
-  <link name="hand"/><link name="finger"/>
-  <joint name="turn" type="revolute"><parent link="floor"/><child link="a"/><origin xyz="1 0.1 0" rpy="1 2 3"/>
-    <axis xyz="0.6 0.8 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="counter" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0.2 0.3" rpy="0.4 0 1"/>
-    <axis xyz="0 0.6 0.8"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
-    <mimic joint="turn" multiplier="-0.5" offset="0.3"/></joint>
-  <joint name="rack" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0.48 0.6 0.64"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/><mimic joint="turn" multiplier="0.1"/></joint>
-  <joint name="mount" type="fixed"><parent link="c"/><child link="d"/><origin xyz="0 0 0.4" rpy="0 1 0"/></joint>
-  <joint name="lift" type="prismatic"><parent link="d"/><child link="e"/><axis xyz="0 1 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-  <joint name="twin" type="prismatic"><parent link="e"/><child link="f"/><origin xyz="0.1 0 0" rpy="0.2 0.3 0"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="lift" offset="-0.1"/></joint>
-  <joint name="wrist" type="revolute"><parent link="f"/><child link="hand"/><axis xyz="1 0 0"/>
-    <origin xyz="0 0.1 0.1" rpy="0 0.1 0.2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-  <joint name="grip" type="revolute"><parent link="hand"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="wrist" multiplier="2"/></joint>
-</robot>"""
+FOLDER = Path(__file__).with_name("urdf")
+CROOKED = FOLDER / "crooked.urdf"
+"""Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must be ignored."""
+LIFT = FOLDER / "lift.urdf"
 """Slides and turns that drive one another."""
 
 

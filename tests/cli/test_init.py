@@ -28,6 +28,7 @@ from init_bank import (
 )
 from kind_bank import kind_named
 from product_bank import simulated_poses
+from robots_bank import FOLDER
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -233,21 +234,14 @@ def test_poses_as_numbers_of_matrices_and_of_other_conventions(by_rows: bool, pr
     assert (written["rotation"], written["convention"], written.get("rotation-angle")) == (",".join(own), name, unit)
 
 
-LIFT = """<robot name="lift"><link name="floor"/>
-<joint name="up" type="prismatic"><parent link="floor"/><child link="a"/><axis xyz="0 0 1"/>
-<limit lower="0" upper="1.5" effort="1" velocity="1"/></joint><link name="a"/>
-<joint name="one" type="revolute"><parent link="a"/><child link="b"/><origin xyz=".1 0 .2"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" effort="1" velocity="1"/></joint><link name="b"/>
-<joint name="two" type="revolute"><parent link="b"/><child link="c"/><origin xyz=".5 0 0"/><axis xyz="0 1 0"/>
-<limit lower="-3" upper="3" effort="1" velocity="1"/></joint><link name="c"/>
-<joint name="end" type="fixed"><parent link="c"/><child link="hand"/><origin xyz=".4 .05 0"/></joint><link name="hand"/>
-</robot>"""
+COLUMN = (FOLDER / "column.urdf").read_text()
+"""A slide and two turning joints."""
 UNIT = torch.rand(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
 def lift(folder: Path, travel: float = 1.2) -> tuple[Tensor, Tensor]:
     """A URDF, joint values (30, 3) and places of the hand (30, 3), rad and m."""
-    (folder / "arm.urdf").write_text(LIFT)
+    (folder / "arm.urdf").write_text(COLUMN)
     q = UNIT * torch.tensor([travel, 3.0, 2.0], dtype=torch.float64) - torch.tensor([0.0, 1.5, 1.0])
     away = torch.randn(30, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     return q, dc.load_urdf(folder / "arm.urdf")(q)[:, :3, 3] + 0.3 + 2e-3 * away
@@ -288,7 +282,7 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     found, _ = proposed((["up", "one [gon]", "two [gon]"], gon), (["East", "North", "Up"], points))
     assert (found["joints"], found["angle"]) == ("up,0.9*{one [gon]},0.9*{two [gon]}", "deg")
     assert found["position"] == ["East,North,Up"]
-    head = LIFT.replace('<origin xyz=".5 0 0"/>', "").replace('"prismatic"', '"fixed"')
+    head = COLUMN.replace('<origin xyz=".5 0 0"/>', "").replace('"prismatic"', '"fixed"')
     (tmp_path / "arm.urdf").write_text(head)  # axes that meet in a point: the rows do not tell the unit of length
     places = dc.load_urdf(tmp_path / "arm.urdf")(q[:, 1:])[:, :3, 3]
     found, text = proposed((["one", "two"], q[:, 1:]), (XYZ, places))

@@ -19,13 +19,8 @@ from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import robot_from_config
 
 
-@pytest.fixture
-def crooked(tmp_path: Path) -> Chain:
-    (tmp_path / "robot.urdf").write_text(CROOKED)
-    return load_urdf(tmp_path / "robot.urdf", "world", "end")
-
-
-def test_attributes_forms_of_values_and_reach(crooked: Chain) -> None:
+def test_attributes_forms_of_values_and_reach() -> None:
+    crooked = load_urdf(CROOKED, "world", "end")
     assert crooked.joint_names == ("slide", "turn", "spin", "lift")
     assert crooked.kinds == ("prismatic", "revolute", "continuous", "prismatic")
     assert crooked.periodic == (False, True, True, False)
@@ -140,10 +135,8 @@ def test_rows_of_a_table_with_mimic(convention: str) -> None:
     torch.testing.assert_close(chain(q), from_dh(free, convention)(full), rtol=0, atol=1e-14)
 
 
-def test_a_driver_off_the_path_is_a_column(tmp_path: Path) -> None:
-    urdf = tmp_path / "lift.urdf"
-    urdf.write_text(LIFT)
-    whole, upper = load_urdf(urdf, "floor", "hand"), load_urdf(urdf, "a", "hand")
+def test_a_driver_off_the_path_is_a_column() -> None:
+    whole, upper = load_urdf(LIFT, "floor", "hand"), load_urdf(LIFT, "a", "hand")
     assert upper.joint_names == ("lift", "wrist", "turn")
     assert upper.moving_names == whole.moving_names[1:]
     q = torch.tensor([[0.3, -0.2, 0.5], [0.1, 0.7, -1.1]], dtype=torch.float64)

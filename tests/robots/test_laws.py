@@ -71,10 +71,8 @@ def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, r
         path, tips = request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "ee_link"
     elif name == "simulated arm":
         SimulatedArm().write_urdf(path)
-    elif name in VIEWS:
-        path = URDF_FILE
     else:
-        path.write_text(LIFT if name == "lift" else CROOKED)
+        path = URDF_FILE if name in VIEWS else LIFT if name == "lift" else CROOKED
     robot, model = load_urdf(path, base, tips, loads), pin.buildModelFromUrdf(str(path), mimic=True)
     data, q = model.createData(), draw(20, robot.n)
     columns = [model.joints[model.getJointId(joint)].idx_v for joint in robot.joint_names]
