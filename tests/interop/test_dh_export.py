@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from export_bank import configurations, own_poses, wrong
-from robots_bank import CHAIN, CHAINS, draw
+from robots_bank import CHAIN, CHAINS, FOLDER, draw
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -117,29 +117,8 @@ def test_wrong_options(tmp_path: Path) -> None:
 
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-QUARTER = math.pi / 2
-JOINTS = {
-    "shoulder_pan_joint": ("base_link", "shoulder_link", "0 0 0.1273", "0 0 0", "0 0 1"),
-    "shoulder_lift_joint": ("shoulder_link", "upper_arm_link", "0 0.220941 0", f"0 {QUARTER!r} 0", "0 1 0"),
-    "elbow_joint": ("upper_arm_link", "forearm_link", "0 -0.1719 0.612", "0 0 0", "0 1 0"),
-    "wrist_1_joint": ("forearm_link", "wrist_1_link", "0 0 0.5723", f"0 {QUARTER!r} 0", "0 1 0"),
-    "wrist_2_joint": ("wrist_1_link", "wrist_2_link", "0 0.1149 0", "0 0 0", "0 0 1"),
-    "wrist_3_joint": ("wrist_2_link", "wrist_3_link", "0 0 0.1157", "0 0 0", "0 1 0"),
-    "tool0_joint": ("wrist_3_link", "tool0", "0 0.0922 0", f"{-QUARTER!r} 0 0", ""),
-    "gripper_joint": ("wrist_3_link", "fingers", "0.01 0.2 0.03", "0.3 0.2 0.1", ""),
-}
-"""A UR10 as its description had it before the transforms were in a file of their own, and a tool."""
-
-
-def urdf(prefix: str = "") -> str:
-    joints = [
-        f'<joint name="{prefix}{name}" type="{"revolute" if axis else "fixed"}"><origin xyz="{xyz}" rpy="{rpy}"/>'
-        f'<parent link="{prefix}{parent}"/><child link="{prefix}{child}"/><axis xyz="{axis or "1 0 0"}"/>'
-        '<limit lower="-6" upper="6" effort="1" velocity="1"/></joint>'
-        for name, (parent, child, xyz, rpy, axis) in JOINTS.items()
-    ]
-    links = dict.fromkeys(prefix + link for ends in JOINTS.values() for link in ends[:2])
-    return "<robot name='ur10'>" + "".join(f'<link name="{link}"/>' for link in links) + "".join(joints) + "</robot>"
+UR10 = (FOLDER / "ur10.urdf").read_text()
+"""As its description had it before the transforms were in a file of their own, and a tool."""
 
 
 def load(path: Path, text: str, tip: str = "tool0", base: str = "base_link") -> Chain:
@@ -184,7 +163,12 @@ def their_poses(links: dict[str, list[float]], q: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.05])
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_path: Path) -> None:
-    robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
+    robot = load(
+        tmp_path / "ur.urdf",
+        re.sub(r'(<link name|<joint name|link)="', rf'\1="{prefix}', UR10),
+        f"{prefix}fingers",
+        f"{prefix}base_link",
+    )
     tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
     zero = torch.zeros(1, 6, dtype=torch.float64)
     flange = torch.linalg.inv(tool(zero)[0])
@@ -196,7 +180,7 @@ def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_
 
 
 def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
-    geometry = Geometry.nominal(load(tmp_path / "ur.urdf", urdf()))
+    geometry = Geometry.nominal(load(tmp_path / "ur.urdf", UR10))
     write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash="calib_4890363623803256388")
     assert read_yaml(tmp_path / "ur.yaml")[1] == "calib_4890363623803256388"
     assert [own[1] for own in HASH.finditer((tmp_path / "ur.yaml").read_text())] == ["calib_4890363623803256388"]
@@ -208,7 +192,6 @@ def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
     new, path = tmp_path / "new.yaml", tmp_path / "ur.urdf"
     with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
         write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)
-    text = urdf()
     for change, tip, base, message in (
         (("", ""), "tool0", "shoulder_link", r"expected shoulder_pan_joint"),
         (('name="elbow_joint" type="revolute"', 'name="elbow_joint" type="prismatic"'), "tool0", "base_link", "joints"),
@@ -216,7 +199,7 @@ def test_the_hash_and_robots_that_are_refused(tmp_path: Path) -> None:
         (("base_link", "ground"), "tool0", "ground", r"the base of robot 'ur10': expected base_link, got ground"),
         (("0 0.0922 0", "0.001 0.0922 0"), "tool0", "base_link", r"'tool0' .*on the axis of the last joint"),
     ):
-        robot = load(path, text.replace(*change), tip, base)
+        robot = load(path, UR10.replace(*change), tip, base)
         with pytest.raises(RobotError, match=message):
             write_ur_kinematics(Geometry.nominal(robot), new)
     assert not new.exists()
