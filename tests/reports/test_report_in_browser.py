@@ -11,46 +11,13 @@ import diffeo_calib as dc
 
 pytestmark = pytest.mark.slow
 
-CONTRAST = """() => {
-  const luminance = (rgb) => {
-    const [r, g, b] = rgb.map((v) => v / 255).map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
-  };
-  const numbers = (text) => (text.match(/[\\d.]+/g) || []).map(Number);
-  const behind = (node) => {
-    for (; node; node = node.parentElement) {
-      const found = numbers(getComputedStyle(node).backgroundColor);
-      if (found.length === 3 || found[3] > 0) return found.slice(0, 3);
-    }
-    return [255, 255, 255];
-  };
-  const bad = [];
-  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
-  while (walker.nextNode()) {
-    const parent = walker.currentNode.parentElement;
-    if (!walker.currentNode.textContent.trim() || ["script", "style"].includes(parent.localName)) continue;
-    const style = getComputedStyle(parent);
-    const drawn = parent.namespaceURI.endsWith("svg") ? style.fill : style.color;
-    const pair = [numbers(drawn).slice(0, 3), behind(parent)].map(luminance).sort((a, b) => b - a);
-    const ratio = (pair[0] + 0.05) / (pair[1] + 0.05);
-    if (ratio < 4.5) bad.push([walker.currentNode.textContent.trim().slice(0, 40), ratio]);
-  }
-  return bad;
-}"""
-DRAWN = """() => [...document.querySelectorAll("canvas")].map((canvas) => {
-  const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
-  let count = 0;
-  for (let k = 3; k < pixels.length; k += 4) count += pixels[k] > 0;
-  return count;
-})"""
-TOO_WIDE = """() => [...document.querySelectorAll("main *")]
-  .filter((node) => !node.closest(".scroll, pre, svg") && node.getBoundingClientRect().right > innerWidth + 1)
-  .map((node) => node.className || node.tagName)"""
-SVG_TEXT = """() => [...document.querySelectorAll("figure svg")].map((svg) => {
-  const scale = svg.getBoundingClientRect().width / svg.viewBox.baseVal.width;
-  const sizes = [...svg.querySelectorAll("text")].map((text) => parseFloat(getComputedStyle(text).fontSize));
-  return scale * Math.min(...sizes);
-})"""
+CHECKS = Path(__file__).with_name("page_checks.js").read_text(encoding="utf-8")
+"""Functions by name."""
+
+
+def asked(page: Any, name: str) -> Any:
+    """What one of the checks finds."""
+    return page.evaluate(f"{CHECKS.strip()}.{name}()")
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +46,11 @@ def opened(browser: Any, report: Path, request: pytest.FixtureRequest) -> Iterat
 
 @pytest.mark.parametrize("opened", [(1400, "light"), (390, "dark")], indirect=True, ids=str)
 def test_everything_is_drawn_and_readable(opened: Any) -> None:
-    assert min(opened.evaluate(DRAWN)) > 2000
-    assert opened.evaluate(TOO_WIDE) == []
+    assert min(asked(opened, "drawn")) > 2000
+    assert asked(opened, "tooWide") == []
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert opened.evaluate(CONTRAST) == []
-    assert min(opened.evaluate(SVG_TEXT)) > 8.0
+    assert asked(opened, "unreadable") == []
+    assert min(asked(opened, "smallestText")) > 8.0
 
 
 def test_the_scene_turns_every_control_is_reached_by_the_keyboard_and_it_prints(opened: Any, tmp_path: Path) -> None:
@@ -120,4 +87,4 @@ def test_the_scene_turns_every_control_is_reached_by_the_keyboard_and_it_prints(
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     opened.emulate_media(media="print")
     assert not opened.is_visible("nav")
-    assert min(opened.evaluate(DRAWN)) > 2000
+    assert min(asked(opened, "drawn")) > 2000
