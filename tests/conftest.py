@@ -95,13 +95,19 @@ BY_KIND = (
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,
-    *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
-    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_rigid.py"),
-    *("test_plan.py", "test_commands.py"),
-    *("test_distributed.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
-    *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
-    *("test_second_device.py", "test_fit.py"),
-    *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_set_ups.py"),
+    *(
+        "test_recalibrate.py",
+        "test_documentation.py",
+        "test_examples.py",
+        "test_evaluators.py",
+        "test_torch_program.py",
+    ),
+    *("test_outliers.py", "test_programs.py", "test_registered.py", "test_moved_devices.py", "test_other_readings.py"),
+    *("test_keops.py", "test_report.py", "test_rigid.py", "test_sockets.py", "test_model_file.py", "test_kills.py"),
+    *("test_plan.py", "test_selection.py", "test_commands.py", "test_distributed.py", "test_robustness.py"),
+    *("test_commanded_poses.py", "test_readings.py", "test_tree_calibrations.py", "test_registration.py"),
+    *("test_calibrate.py", "test_hardware.py", "test_unusual_data.py", "test_second_device.py", "test_fit.py"),
+    *("test_calibrated.py", "test_correct_command.py", "test_set_ups.py"),
 )
 """File names, those of a quarter of a minute and more; all others follow in the usual order."""
 
