@@ -21,7 +21,7 @@ import product_bank
 import pytest
 from command_bank import Command, leave_undrawn
 from kind_bank import KINDS
-from product_bank import Case, calibrated, ur10_measurements, ur10_scales, usual_scales, with_usual_scales
+from product_bank import Case, calibrated, simulated, ur10_measurements, ur10_scales, usual_scales, with_usual_scales
 from shared_bank import begin, shared
 
 import diffeo_calib as dc
@@ -54,6 +54,20 @@ def slider() -> Case:
     train, test = product_bank.erring(robot, 50), product_bank.erring(robot, 300, seed=1)
     scales = usual_scales(robot).inflated(2.0)
     return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train, hyperparameters=scales)))
+
+
+@pytest.fixture(scope="session")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file of a model of nine poses, short enough to test damage all over it."""
+    path = tmp_path_factory.mktemp("sound") / "model.safetensors"
+
+    def make() -> bytes:
+        arm, train, _ = simulated(9)
+        with pytest.warns(dc.DiffeoCalibWarning, match="9 poses are too few"):
+            dc.save(dc.calibrate(arm.nominal, train).model, path)
+        return path.read_bytes()
+
+    return shared("sound", make)
 
 
 @pytest.fixture

@@ -56,22 +56,10 @@ def small_site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 
 
 @pytest.fixture(scope="session")
-def sound(small_site: Site) -> bytes:
-    path = small_site.folder / "sound.safetensors"
-
-    def make() -> bytes:
-        with pytest.warns(dc.DiffeoCalibWarning, match="10 poses are too few"):
-            dc.save(dc.calibrate(small_site.arm.nominal, small_site.data.rows(slice(10))).model, path)
-        return path.read_bytes()
-
-    path.write_bytes(shared("sound site", make))
-    return path.read_bytes()
-
-
-@pytest.fixture(scope="session")
 def sound_path(small_site: Site, sound: bytes) -> Path:
-    assert sound
-    return small_site.folder / "sound.safetensors"
+    path = small_site.folder / "sound.safetensors"
+    path.write_bytes(sound)
+    return path
 
 
 @pytest.fixture

@@ -10,9 +10,8 @@ import jsonschema
 import pytest
 from command_bank import VALIDATOR, Command, Site, edited, rows_of
 from commanded_bank import flange, seen, write_columns
-from deformation_bank import model_of
+from deformation_bank import fitted_plain, model_of
 from init_bank import write_socket_table, write_wire_table
-from model_file_bank import planar
 from table_bank import in_order
 from two_arms_bank import robot as two_arms
 
@@ -58,7 +57,7 @@ def cell(small_site: Site, sound: bytes, tmp_path_factory: pytest.TempPathFactor
     write_columns(
         folder / "poses.csv", X_Y_Z=1e3 * poses[:, :3, 3], **turns, tx_ty_tz=1e3 * board[:, :3, 3], qx_qy_qz_qw=turned
     )
-    dc.save(planar(rows=6).model, folder / "plain")
+    dc.save(fitted_plain("gaussian"), folder / "plain")
     hands = model_of(two_arms(folder), dc.RK4(1))
     dc.save(hands, folder / "hands")
     (folder / "hands.csv").write_text(";".join(hands.robot.joint_names) + "\n0;0;0;0;0\n")

@@ -1,5 +1,6 @@
 """Model files: round trips, contents, files of earlier versions; damaged and edited ones are refused by a sentence."""
 
+import copy
 import hashlib
 import json
 import os
@@ -20,7 +21,6 @@ import pytest
 import torch
 from deformation_bank import model_of
 from math_bank import constant_kernel
-from model_file_bank import Editor, planar, refused, set_entry, set_tensor
 from product_bank import Case
 from robots_bank import CHAINS, draw
 from safetensors.torch import save_file
@@ -30,13 +30,79 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.interop import model_file
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.kernels.base import SumKernel
+from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.registered_map import Registration
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.robots.se3 import twist_transform
+
+
+def planar(kernel_x: Kernel | None = None, kernel_y: Kernel | None = None) -> dc.Fit:
+    """A fit of the planar elastic robot, a plain function."""
+    x = torch.from_numpy(np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2)))
+    problem = dc.Problem(
+        elastic_rr.nominal,
+        x,
+        elastic_rr.real(x),
+        joint_kernel=kernel_x or dc.VonMises((1.0, 2.0), 0.1),
+        task_kernel=kernel_y or dc.Gaussian(0.5, 0.01),
+        noise=0.02,
+    )
+    return dc.fit(problem, integrator=dc.RK4(2))
+
+
+def refused(path: Path) -> str:
+    """The message, one clear sentence, with which a file is refused."""
+    with pytest.raises(ModelFileError) as caught:
+        dc.load(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    assert len(text) < 800
+    return text
+
+
+class Editor:
+    """Edits a sound file and renews its checksum, so that the remaining checks are reached."""
+
+    def __init__(self, sound: bytes, folder: Path) -> None:
+        self.path = folder / "edited.safetensors"
+        self.path.write_bytes(sound)
+        self.header, self.tensors = model_file.read(self.path)
+
+    def write(self, edit: Callable[[dict[str, Any], dict[str, Tensor]], object], *, sign: bool = True) -> Path:
+        header, tensors = copy.deepcopy(self.header), {name: t.clone() for name, t in self.tensors.items()}
+        digest = model_file.digest(header, tensors)
+        edit(header, tensors)
+        header["digest"] = model_file.digest(header, tensors) if sign else digest
+        save_file(tensors, self.path, metadata={model_file.ENTRY: json.dumps(header)})
+        return self.path
+
+
+def set_entry(*keys: Any, value: Any) -> Callable[[Any, Any], None]:
+    def edit(header: Any, _: Any) -> None:
+        for key in keys[:-1]:
+            header = header[key]
+        header[keys[-1]] = value
+
+    return edit
+
+
+def set_tensor(name: str, change: Callable[[Tensor], Tensor | None]) -> Callable[[Any, Any], None]:
+    def edit(_: Any, tensors: dict[str, Tensor]) -> None:
+        new = change(tensors.pop(name))
+        if new is not None:
+            tensors[name] = new.contiguous()
+
+    return edit
+
+
+@pytest.fixture
+def editor(sound: bytes, tmp_path: Path) -> Editor:
+    return Editor(sound, tmp_path)
+
 
 MIXED = dc.Space((True, False))
 KERNELS = (
@@ -207,10 +273,10 @@ def test_where_a_calibration_comes_from(arm: Case, tmp_path: Path) -> None:
     model = dc.CalibratedKinematics(arm.robot, arm.model.map, summary, tool=[0, 0, 0.1], provenance=provenance)
     other = model.with_tool([0.1, 0, 0]).to("cpu")
     dc.save(other, tmp_path / "model")
-    for copy in (other, dc.load(tmp_path / "model")):
-        assert isinstance(copy, dc.CalibratedKinematics)
-        assert (copy.provenance, copy.summary) == (provenance, summary)
-        assert copy.tool[0, 3] == 0.1
+    for own in (other, dc.load(tmp_path / "model")):
+        assert isinstance(own, dc.CalibratedKinematics)
+        assert (own.provenance, own.summary) == (provenance, summary)
+        assert own.tool[0, 3] == 0.1
     dc.save(arm.model.changed(summary=None), tmp_path / "model")
     again: Any = dc.load(tmp_path / "model")
     assert (again.summary, again.report) == (None, {})
