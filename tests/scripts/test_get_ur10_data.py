@@ -10,6 +10,8 @@ import pytest
 import torch
 from robot_data import find, read
 
+import diffeo_calib as dc
+
 JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)
 ROWS = [f"{0.1 * k:.1f};0,2;0,3;0,4;0,5;{0.2 * k:.1f};10{k},5;2;3;10;20;30".replace(".", ",") for k in range(4)]
 POSITION = "measurement_x;measurement_y;measurement_z;measurement_rx;measurement_ry;measurement_rz"
@@ -40,6 +42,9 @@ def test_writes_what_the_benchmark_reads(small: Path, tmp_path: Path, capsys: py
     data = read(own, find(folder)["ipa_ur10"])
     assert data.measurements.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
     assert data.measurements.q[1, [0, 5]].tolist() == pytest.approx([0.1, 0.2])
+    rows = zip(get_ur10_data.LENGTHS, get_ur10_data.TWISTS, get_ur10_data.OFFSETS, strict=True)
+    q = torch.linspace(-3.0, 3.0, 60, dtype=torch.float64).reshape(10, 6)
+    torch.testing.assert_close(data.robot(q), dc.from_dh([*rows], "standard")(q), rtol=0, atol=1e-14)
     torch.testing.assert_close(data.robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
     before = (own / "dataset.json").stat().st_mtime_ns
     get_ur10_data.main([str(folder), "--from", str(small.parent)])  # again: nothing to do
