@@ -14,7 +14,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 QUICK="tests/test_package.py tests/common/test_threads.py tests/flows/test_geodesic.py tests/kernels/test_fused_sums.py \
 tests/robots/test_chains.py tests/cameras tests/measurements/test_bags.py tests/measurements/test_table.py \
 tests/interop/test_model_file.py tests/interop/test_sklearn.py tests/interop/test_torch_program.py \
-tests/interop/test_mjcf.py tests/cli/test_help.py tests/cli/test_refused_commands.py"
+tests/interop/test_urdf_export.py tests/cli/test_help.py tests/cli/test_refused_commands.py"
 read -ra TESTS <<<"${DIFFEO_CALIB_TESTS:-$QUICK}"
 SUM="import torch, diffeo_calib as dc; dc.Gaussian(1.0).using('keops').field(None, *torch.rand(2, 9, 3, dtype=torch.float64))"
 WORK="$(mktemp -d)"

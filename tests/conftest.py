@@ -96,8 +96,8 @@ BY_KIND = (
 LONGEST = (
     *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
-    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_tool.py", "test_rigid.py"),
-    *("test_plan.py", "test_json_results.py"),
+    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_rigid.py"),
+    *("test_plan.py", "test_commands.py"),
     *("test_distributed.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
     *("test_second_device.py", "test_fit.py"),

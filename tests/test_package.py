@@ -95,21 +95,15 @@ def test_files_and_extras_exist() -> None:
     assert [name for name in names if not (PACKAGE.parent / name).exists()] == []
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    arm, train, test = simulated(30)
+def test_the_steps_of_a_calibration(caplog: pytest.LogCaptureFixture) -> None:
+    arm, train, _ = simulated(30)
     points = train.points.clone()
     points[7] += 0.01
     with caplog.at_level(logging.INFO, logger="diffeo_calib"):
-        result = with_usual_scales(arm.nominal, dc.Measurements(train.q, points))
-        dc.save(result.model, tmp_path / "arm.safetensors")
-        both = dc.Measurements.joined([train[:20], test[:20]])
-        dc.write_report(result.model, tmp_path / "arm.html", both)
+        with_usual_scales(arm.nominal, dc.Measurements(train.q, points))
     found = [record.getMessage() for record in caplog.records if record.name.startswith("diffeo_calib.")]
     assert {record.levelname for record in caplog.records} == {"INFO"}
     begins = ("calibrating", "registration: ", "scales: ", "fit of 30 rows: converged", "rows that look")
     places = [next(k for k, text in enumerate(found) if text.startswith(begin)) for begin in begins]
     assert places == sorted(places)
     assert found[places[-1]] == "rows that look wrong and hardly count: 7"
-    assert f"model written to {tmp_path}/arm.safetensors" in found
-    assert "judged by 20 rows it has not seen, 20 were used before" in found

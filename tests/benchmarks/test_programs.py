@@ -1,11 +1,13 @@
-"""Kernel sums give the same answer every way, splits share no row, and nothing untrue is said of clean tables."""
+"""The guard finds what is worse; kernel sums are exact, splits share no row, nothing untrue is said of clean tables."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import clean_campaigns
 import false_alarms
+import guard
 import ours
 import peers
 import protocols
@@ -16,8 +18,44 @@ from landmarks import Landmarks, Method, exact, landmarks
 import diffeo_calib as dc
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+BASELINE = Path(guard.__file__).parent / "baselines" / "guard.json"
+ANY_PROCESSOR = guard.Tolerance(case=1.15, mean=1.05, share=0.05, time=float("inf"))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> guard.Cases:
+    return guard.cases(guard.read(BASELINE))
+
+
+def test_a_robot_is_calibrated_as_well_as_recorded(recorded: guard.Cases, monkeypatch: pytest.MonkeyPatch) -> None:
+    verbs = {"calibrate", "evaluate", "predict", "registered", "recalibrate", "compare"}
+    kept = {verb: work for verb, work in guard.guard_verbs.VERBS.items() if verb in verbs}
+    monkeypatch.setattr(guard.guard_verbs, "VERBS", kept)
+    found = guard.cases(guard.measured(guard.QUICK[0]))
+    assert {verb for verb, _ in found} == verbs
+    rows, worse = guard.judged(found, recorded, ANY_PROCESSOR)
+    assert rows[-1]["errors"] >= 5
+    assert not worse
+
+
+CASE = ("calibrate", "positions")
+
+
+WORSE = {"error": 1.06, "true": 1.06, "new": 0.8, "inside": 0.8, "said": 2.0}
+
+
+def test_a_worse_case_is_found_and_the_baseline_is_not_worse_than_itself(recorded: guard.Cases) -> None:
+    rows, worse = guard.judged(recorded, recorded, guard.Tolerance())
+    assert not worse
+    assert rows[-1]["mean_ratio"] == pytest.approx(1.0)
+    assert not [note for own in recorded.values() for note in own.get("note", []) if note]
+    for field, factor in [*WORSE.items(), ("true", None)]:
+        found = copy.deepcopy(recorded)
+        found[CASE][field] = [factor and factor * value for value in found[CASE][field]]
+        ((sentence),) = guard.judged(found, recorded, guard.Tolerance(mean=2.0))[1]
+        names = {"said": "expected and true error"}.get(field, field) if factor else "no true any more"
+        assert sentence.startswith(f"calibrate, positions: {names}")
+
 
 ROWS = slice(0, 20)
 METHODS: tuple[type[Method], ...] = (ours.Ours, ours.Dense, ours.Tiled, peers.NaiveDense, peers.DenseAutograd)

@@ -1,7 +1,6 @@
 """A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
 import errno
-import http.client
 import io
 import json
 import os
@@ -10,11 +9,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
+from urllib.request import Request, urlopen
 
 import pytest
 from command_bank import PROGRAM, Command, Outcome
@@ -345,11 +344,8 @@ def test_pages_of_nothing_and_of_a_row(tmp_path: Path, run: Callable[..., tuple[
         page = free.getsockname()[1]
 
     def asked(method: str, path: str) -> bytes:
-        connection = http.client.HTTPConnection("127.0.0.1", page, timeout=60)
-        with closing(connection):
-            connection.request(method, path, headers={"X-Campaign": "1"})
-            answer = connection.getresponse()
-            assert answer.status == 200
+        request = Request(f"http://127.0.0.1:{page}{path}", method=method, headers={"X-Campaign": "1"})
+        with urlopen(request, timeout=60) as answer:
             return answer.read()
 
     def shown(text: str) -> tuple[int, int]:

@@ -133,7 +133,7 @@ def test_rows_near_a_wrong_one_stay(running: dc.Campaign, measured: tuple[Tensor
 
 
 def test_rows_together_have_the_verdicts_of_single_ones(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
-    """With a wrong row among them. Of a large table few models are made."""
+    """With a wrong row among them."""
     q, y = (part[ROWS : ROWS + 5].clone() for part in measured)
     y[2] += 5 * MM
     campaign, verdicts = after(running, q, y)
@@ -144,9 +144,6 @@ def test_rows_together_have_the_verdicts_of_single_ones(running: dc.Campaign, me
         found, expected = ((each.error, each.expected, each.expected_error) for each in (one, single))
         assert found == pytest.approx(expected, rel=1e-8)
     assert campaign.expected_error == pytest.approx(other.expected_error, rel=1e-8)
-    assert other._due == 30
-    other._waiting = 1000 - len(other.accepted)
-    assert other._due == 64
 
 
 def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:
@@ -265,10 +262,6 @@ def test_limits_and_goals(running: dc.Campaign, measured: tuple[Tensor, Tensor])
         assert campaign.reached == (needed == 0)
         assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
         assert needed is None or campaign.next(1).needed == needed
-    campaign._make(campaign.table, campaign.verdicts)  # around all rows, with the same scales
-    campaign.poll()
-    assert (campaign._model.count, campaign._next_scales(campaign._model)) == (ROWS, pytest.approx(2.0 * 20))
-    assert 1.1 < campaign.error_limit / campaign.expected_error < 2
     few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
     assert few.expected_error is not None
     assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"

@@ -157,6 +157,8 @@ def test_a_path_and_rows_that_miss(model: dc.CalibratedKinematics, program: Path
     assert "and 2 more; see the column `status`" in done.out
     moved = table([after[0]], names) - table([rows[0]], names)
     assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
+    done = command.ran("correct", model, program, *UNITS, "--tool", "0,0,3000", "-o", output)
+    assert any("--tool is 3 m long, more than the robot reaches" in line for line in done.warnings)
 
 
 def test_from_the_measured_frame(posed: Case, program: Path, command: Command) -> None:
@@ -209,35 +211,3 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
         found = table(after, [f"miss_{hand}_mm", f"angle_miss_{hand}_rad"])
         own = torch.stack([1e3 * expected.miss[:, k], held(expected.angle_miss)[:, k]], 1)
         np.testing.assert_allclose(found, own.numpy(), rtol=1e-9, atol=1e-9)
-
-
-BOTH = ["--tip", "left", "--tip", "right"]
-
-
-@pytest.mark.usefixtures("model")
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--tool", "1,2"], "--tool 1,2: expected X,Y,Z, or 6 numbers with the rotation as 'rotvec'"),
-        (["--tool", "1,2,3,1,1,1,1", "--convention", "quat_xyzw"], "--tool: expected a quaternion of length 1"),
-        (["--tool", "0,0,3000"], "warning: --tool is 3 m long, more than the robot reaches"),
-        (["--tool", "0,0,150", "--length", "m"], "error: --tool is 150 m long, more than the robot reaches"),
-        (["--tool", "measured:0,0,0.1"], "calibrated with points, which have no measured frame"),
-        (["--frame", "measuring"], "--frame measuring: the nominal poses of commands are in the robot's base"),
-        (["--limit", "0"], "--limit: expected a number above 0"),
-        (["--rotation", "a,b,c"], "--rotation without --position"),
-        (["--tip", "left", "--tip", "left"], "--tip left is named twice"),
-        (["--tip", "left", "--tip", "foot"], "--tip: expected one of"),
-        ([*BOTH, "--tool", "0,0,1"], "--tool: expected 2 of them, got 1"),
-        ([], "has several tips"),
-    ],
-)
-def test_wrong_options(options: list[str], message: str, program: Path, command: Command) -> None:
-    output, path = program.with_name("c.csv"), program.with_name("model.safetensors")
-    if not options or "--tip" in options:
-        arms = model_of(two_arms(program.parent), dc.RK4(1))
-        dc.save(arms, path)
-        program.write_text(";".join(arms.robot.joint_names) + "\n0;0;0;0;0\n")
-    done = command("correct", path, program, *UNITS, *options, "-o", output)
-    assert message in " ".join(done.err.split())
-    assert (done.code, output.exists()) == ((0, True) if "warning" in message else (1, False))

@@ -1,12 +1,14 @@
 """Wrong usage, options and tables with mistakes, broken files: an exit code and one sentence that says what to do."""
 
+import json
 import os
 import re
 from functools import partial
 from pathlib import Path
 
+import jsonschema
 import pytest
-from command_bank import Command, Site, edited, rows_of
+from command_bank import VALIDATOR, Command, Site, edited, rows_of
 from commanded_bank import flange, seen, write_columns
 from deformation_bank import model_of
 from init_bank import write_socket_table, write_wire_table
@@ -18,6 +20,7 @@ import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.results import SCHEMA
 
 
 def test_unconverged_is_exit_3(site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,3 +184,37 @@ def test_outputs_are_checked_before_the_fit(small_site: Site, command: Command, 
             done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
             assert done.code == 1
             assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
+
+
+def test_results_of_errors_and_places_that_are_taken(cell: Path, tmp_path: Path, command: Command) -> None:
+    """With --json: results for programs, as the schema describes them."""
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    out, model, predicted, table = tmp_path / "out.json", cell / "model", tmp_path / "p.csv", cell / "points.csv"
+    assert command("evaluate", "none.safetensors", table, *MM.split(), "--json", out).code == 1
+    written = json.loads(out.read_text(encoding="utf-8"))
+    VALIDATOR.validate(written)
+    assert (written["exit_code"], written["results"], written["arguments"][0]) == (1, {}, "evaluate")
+    assert "none.safetensors" in written["error"]
+    before = model.read_bytes()
+    for place, words in ((model, "--json"), (predicted, "--json"), (tmp_path / "none" / "x.json", "make its folder")):
+        assert words in command.failed("predict", model, table, *UNITS.split(), "-o", predicted, "--json", place)
+    assert model.read_bytes() == before
+    assert not predicted.exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "predict model new.csv --length furlong --json out.json",
+        "predict model --no-such-option --json=out.json",
+        "fit none.toml --json out.json",
+        "fit c.toml",
+    ],
+)
+def test_an_earlier_result_is_removed(words: str, tmp_path: Path, command: Command) -> None:
+    """The command ends before it could begin: nothing is left, whatever the exit code is looked at."""
+    command.monkeypatch.chdir(tmp_path)
+    Path("out.json").write_text('{"format": "diffeo_calib result", "exit_code": 0}', encoding="utf-8")
+    Path("c.toml").write_text('csv = "new.csv"\njson = "out.json"\nlength = "furlong"\n', encoding="utf-8")
+    assert command(*words.split()).code in (1, 2)
+    assert not Path("out.json").exists()

@@ -28,81 +28,84 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, ModelFileError
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop import model_file
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.registered_map import Registration
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.robots.se3 import twist_transform
 
+MIXED = dc.Space((True, False))
+KERNELS = (
+    *(dc.Gaussian((0.7, 1.1), 0.02), dc.Matern(0.9, 1.5, 0.02), dc.Matern(0.9, 2.5, 0.01)),
+    *(dc.Matern(0.9, 3.5, 0.02, space=MIXED), dc.Cauchy(0.8, (0.01, 0.02)), constant_kernel(0.05)),
+    *(dc.VonMises((1.0, 2.0), (0.02, 0.01)), dc.PerJoint((0.5, 0.9), (0.01, 0.0), MIXED)),
+)
 
-def test_robot_models_come_back_bit_for_bit(arm: Case, tmp_path: Path) -> None:
-    model, q = arm.model, arm.test.q[:50]
-    dc.save(model, tmp_path / "model.safetensors")
-    again = dc.load(tmp_path / "model.safetensors")
-    assert isinstance(again, dc.CalibratedKinematics)
-    assert torch.equal(again.jacobian(q), model.jacobian(q))
-    for mine, theirs in zip(again.predict(q), model.predict(q), strict=True):
-        assert torch.equal(mine, theirs)
-    assert again.report == model.report
-    assert again.robot.to_config() == model.robot.to_config()
-    assert again.rigid_errors is not None
-    assert torch.equal(again.rigid_errors, arm.result.identification.geometry.joint_errors)
-    dc.save(again, tmp_path / "again.safetensors")
-    assert torch.equal(dc.load(tmp_path / "again.safetensors")(q), model(q))
+
+def coarse(integrator: dc.RK8 | dc.TorchDiffEq) -> Any:
+    """Fewer control points than measurements: the covariance needs the measured configurations too."""
+    x = elastic_rr.grid(5)
+    kernels: dict[str, Any] = {"joint_kernel": dc.VonMises(1.0, 0.1), "task_kernel": dc.Gaussian(0.7, 0.1)}
+    problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), noise=0.05, **kernels)
+    model = dc.fit(problem, dc.GaussNewton(max_iterations=2), integrator, controls=12).model
+    assert (len(model.deformation.x), len(model.x)) == (12, 25)
+    return model
+
+
+def turned(case: Case, **how: Any) -> Any:
+    """Registered by held-out rows that another device saw, with a tool."""
+    T = twist_transform(draw(6, seed=16))
+    return case.model.registered(case.test[:12].in_frames(T.expand(12, 4, 4)), **how).with_tool([0, 0, 0.1])
+
+
+MODELS: dict[str, Callable[[Any], Any]] = {
+    "a robot": lambda given: given("arm").model,
+    "a registered robot": lambda given: turned(given("arm")),
+    "registered poses, not learnt": lambda given: turned(given("posed"), learn=False),
+    "every kernel": lambda _: planar(SumKernel(KERNELS), SumKernel(KERNELS[::-1])).model,
+    "few controls": lambda _: coarse(dc.RK8(1)),
+    "other steps": lambda _: coarse(dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9)),
+}
+SLOW = ("a registered robot", "registered poses, not learnt")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in MODELS])
+def test_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    model, robot = MODELS[name](request.getfixturevalue), name in list(MODELS)[:3]
+    q = draw(20, 6 if robot else 2, seed=5)
+    dc.save(model, tmp_path / "model")
+    again: Any = dc.load(tmp_path / "model", *[elastic_rr.nominal] * (not robot))
+    dc.save(again, tmp_path / "again")
+    for found in (again, again.to("cpu"), dc.load(tmp_path / "again", *[elastic_rr.nominal] * (not robot))):
+        assert type(found) is type(model)
+        for ask in ("__call__", "jacobian", "predict", *["tool_poses"] * robot):
+            ours, theirs = (getattr(one, ask)(q) for one in (found, model))
+            assert all(map(torch.equal, ours, theirs)), ask
+        if not robot:
+            assert found.deformation.integrator == model.deformation.integrator
+            continue
+        assert (found.report, found.provenance, found.lever) == (model.report, model.provenance, model.lever)
+        assert found.robot.to_config() == model.robot.to_config()
+        assert torch.equal(found.rigid_errors, model.rigid_errors)
+        for field in Registration.__dataclass_fields__ if model.registration else ():
+            mine, wanted = (getattr(one.registration, field) for one in (found, model))
+            assert torch.equal(mine, wanted) if isinstance(mine, Tensor) else mine == wanted
+        near = load_numpy(tmp_path / "model")(q.numpy())
+        np.testing.assert_allclose(near, model(q).numpy(), rtol=0, atol=1e-12)
 
 
 def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
-    fit, path = planar(), tmp_path / "plain.safetensors"
-    dc.save(fit.model, path)
-    x = torch.rand(30, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    again = dc.load(path, nominal=elastic_rr.nominal)
-    assert isinstance(again, FittedMap)
-    assert torch.equal(again(x), fit.model(x))
-    assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
+    path = tmp_path / "plain.safetensors"
+    dc.save(planar().model, path)
     with pytest.raises(InputError, match=r"`nominal` is missing.*same function again"):
         dc.load(path)
     for other in (lambda x: x[:, :1], lambda x: x, elastic_rr.real):
         with pytest.raises(InputError, match="`nominal` is not the map that the model was fitted to"):
             dc.load(path, nominal=other)
-
-
-def test_every_kernel_comes_back(tmp_path: Path) -> None:
-    mixed = dc.Space((True, False))
-    kernels = (
-        *(dc.Gaussian((0.7, 1.1), 0.02), dc.Matern(0.9, 1.5, 0.02), dc.Matern(0.9, 2.5, 0.01)),
-        *(dc.Matern(0.9, 3.5, 0.02, space=mixed), dc.Cauchy(0.8, (0.01, 0.02)), constant_kernel(0.05)),
-        *(dc.VonMises((1.0, 2.0), (0.02, 0.01)), dc.PerJoint((0.5, 0.9), (0.01, 0.0), mixed)),
-    )
-    fit, path = planar(SumKernel(kernels), SumKernel(kernels[::-1])), tmp_path / "model.safetensors"
-    dc.save(fit.model, path)
-    x = torch.linspace(-2, 2, 24, dtype=torch.float64).reshape(12, 2)
-    again = dc.load(path, nominal=elastic_rr.nominal)
-    assert torch.equal(again(x), fit.model(x))
-    assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
-
-
-@pytest.mark.parametrize(
-    "integrator",
-    [dc.RK8(1), dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9)],
-    ids=["rk8", "torchdiffeq"],
-)
-def test_coarse_models_keep_their_data_and_integrator(integrator: dc.RK8 | dc.TorchDiffEq, tmp_path: Path) -> None:
-    """Fewer control points than measurements: the covariance needs the measured configurations too."""
-    x = elastic_rr.grid(5)
-    kernels = {"joint_kernel": dc.VonMises(1.0, 0.1), "task_kernel": dc.Gaussian(0.7, 0.1)}
-    problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), noise=0.05, **kernels)  # pyright: ignore[reportArgumentType]
-    model = dc.fit(problem, dc.GaussNewton(max_iterations=2), integrator, controls=12).model
-    dc.save(model, tmp_path / "coarse.safetensors")
-    again = dc.load(tmp_path / "coarse.safetensors", elastic_rr.nominal)
-    assert isinstance(again, FittedMap)
-    assert again.deformation.integrator == integrator
-    assert (len(again.deformation.x), len(again.x)) == (12, 25)
-    for actual, expected in zip(again.predict(x[:3]), model.predict(x[:3]), strict=True):
-        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("name", "waves"), [("arm", True), ("mimic slides", False), ("wrist in one point", False)])
@@ -337,12 +340,6 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_ENTRIES)
-def test_wrong_entries(name: str, editor: Editor) -> None:
-    keys, value, message = WRONG_ENTRIES[name]
-    assert message in refused(editor.write(set_entry(*keys, value=value)))
-
-
 NOT_UNDERSTOOD = ("units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever")
 MISSING: dict[str, Callable[[Any, Any], object]] = {
     **{k: lambda header, _, k=k: header.pop(k) for k in NOT_UNDERSTOOD},
@@ -351,12 +348,6 @@ MISSING: dict[str, Callable[[Any, Any], object]] = {
     **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_file.MOMENTA, *model_file.GEOMETRY)},
 }
 """Entries of the header, of a joint and of elasticity, and tensors."""
-
-
-@pytest.mark.parametrize("name", MISSING)
-def test_missing_parts(name: str, editor: Editor) -> None:
-    expected = "not understood" if name in NOT_UNDERSTOOD else f"do not fit together ('{name}')"
-    assert expected in refused(editor.write(MISSING[name]))
 
 
 WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
@@ -375,9 +366,18 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_TENSORS)
-def test_wrong_tensors(name: str, editor: Editor) -> None:
-    assert "do not fit together" in refused(editor.write(set_tensor(*WRONG_TENSORS[name])))
+EDITS: dict[str, tuple[Callable[[Any, Any], object], str]] = {
+    **{name: (set_entry(*keys, value=value), message) for name, (keys, value, message) in WRONG_ENTRIES.items()},
+    **{name: (set_tensor(*how), "do not fit together") for name, how in WRONG_TENSORS.items()},
+    **{f"no {name}": (edit, f"do not fit together ('{name}')") for name, edit in MISSING.items()},
+    **{f"no {name}": (MISSING[name], "not understood") for name in NOT_UNDERSTOOD},
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_wrong_and_missing_parts(name: str, editor: Editor) -> None:
+    edit, message = EDITS[name]
+    assert message in refused(editor.write(edit))
 
 
 @pytest.mark.parametrize("steps", [0, 0.5, True, 10**5, 10**30])

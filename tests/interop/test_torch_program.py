@@ -19,7 +19,6 @@ from diffeo_calib.interop.torch_program import TorchProgram, export_onnx, export
 from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks, poses_of_triangles
 from diffeo_calib.robots.se3 import rotation, transforms
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 TOOL = [0.05, 0.1, 0.25]
 RUN = """
 import sys, torch

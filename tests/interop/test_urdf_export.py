@@ -1,11 +1,13 @@
-"""Corrected URDF files: the poses of the geometry in two readers, and every other byte as it was."""
+"""Corrected URDF and MJCF files: the poses of the geometry in other readers, every other byte as it was."""
 
 import math
 import re
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
@@ -14,9 +16,11 @@ from robots_bank import draw
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.urdf import origin_numbers, urdf_of, write_urdf
-from diffeo_calib.robots import Geometry
+from diffeo_calib.interop.urdf import mjcf_text, origin_numbers, urdf_of, write_mjcf, write_urdf
+from diffeo_calib.robots import Geometry, SimulatedArm
+from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
+from diffeo_calib.robots.tree import Chain
 
 MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="lift" multiplier="-0.5" offset="0.2"/>')
 TEXTS = {
@@ -94,7 +98,7 @@ def test_angles_of_an_origin_are_exact_also_where_they_are_ambiguous(lever: floa
 
 
 def test_a_model_brings_its_own_urdf(tmp_path: Path) -> None:
-    """Byte for byte, whatever they are. Of its rigid kinematics: tests/cli/test_export_command.py."""
+    """Byte for byte, whatever they are. Of its rigid kinematics: tests/cli/test_commands.py."""
     text = UGLY.replace('utf-8"', 'iso-8859-1"').replace("-->", "\xff -->")
     chain = write_ugly(tmp_path / "robot.urdf", text, "latin-1")
     dc.save(model_of(chain), tmp_path / "model.safetensors")
@@ -141,3 +145,84 @@ def test_texts_of_two_bytes_per_letter_are_refused(encoding: str, tmp_path: Path
     chain = write_ugly(tmp_path / "robot.urdf", "\ufeff" * (encoding != "utf-16") + text, encoding)
     with pytest.raises(RobotError, match="save the file in UTF-8"):
         write_urdf(wrong(chain), tmp_path / "new.urdf")
+
+
+needs_mujoco = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
+
+
+def tip_poses(model: Any, chain: dc.Tree, q: torch.Tensor) -> torch.Tensor:
+    import mujoco
+
+    data, found = mujoco.MjData(model), torch.eye(4, dtype=torch.float64).repeat(len(q), 1, 1)
+    for row, values in enumerate(chain.moving_values(q).numpy()):
+        for name, value in zip(chain.moving_names, values, strict=True):
+            data.joint(name).qpos[0] = value
+        mujoco.mj_kinematics(model, data)
+        site = data.site(chain.tips[0])
+        found[row, :3, 3] = torch.from_numpy(site.xpos.copy())
+        found[row, :3, :3] = torch.from_numpy(site.xmat.reshape(3, 3).copy())
+    return found
+
+
+def inertia(body: Any) -> np.ndarray:
+    import mujoco
+
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, body.iquat)
+    return R.reshape(3, 3) @ np.diag(body.inertia) @ R.reshape(3, 3).T
+
+
+@needs_mujoco
+@pytest.mark.parametrize("text", [UGLY, MIMIC], ids=["ugly", "mimic"])
+def test_mujoco_finds_the_tip_where_the_geometry_has_it(text: str, tmp_path: Path) -> None:
+    import mujoco
+
+    (tmp_path / "before.urdf").write_text(text)
+    chain = dc.load_urdf(tmp_path / "before.urdf", *UGLY_ENDS)
+    geometry, q = wrong(chain), configurations(chain)
+    write_mjcf(geometry, tmp_path / "after.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "after.xml"))
+    torch.testing.assert_close(tip_poses(model, chain, q), own_poses(geometry, q), rtol=0, atol=1e-12)
+    assert model.neq == sum(joint.mimic is not None for joint in chain.joints)
+    for joint in chain.joints:
+        if joint.mimic is not None:
+            np.testing.assert_allclose(model.eq_data[0, :2], [joint.mimic_offset, *joint.mimic.values()])
+
+
+@needs_mujoco
+def test_limits_masses_inertias_and_names(tmp_path: Path) -> None:
+    import mujoco
+
+    arm = SimulatedArm(seed=0)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    text = (tmp_path / "arm.urdf").read_text()
+    turned = re.sub(r'(<inertial>\s*<origin xyz="[^"]*")[^/]*/>', r'\1 rpy="0.3 -0.5 0.7"/>', text)
+    assert turned != text
+    (tmp_path / "arm.urdf").write_text(turned)
+    chain = dc.load_urdf(tmp_path / "arm.urdf", "base_link", "flange")
+    ours = mujoco.MjModel.from_xml_string(mjcf_text(wrong(chain)))
+    theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.urdf"))
+    np.testing.assert_allclose(ours.jnt_range, chain.limits.numpy())
+    for joint in chain.moving_names:
+        here, there = (model.body(model.jnt_bodyid[model.joint(joint).id]) for model in (ours, theirs))
+        assert here.name == there.name
+        np.testing.assert_allclose(here.mass, there.mass)
+        np.testing.assert_allclose(here.ipos, there.ipos, atol=1e-12)
+        np.testing.assert_allclose(inertia(here), inertia(there), rtol=0, atol=1e-9)
+    robot = dc.from_dh([(0.3, 0.0, 0.1), (0.2, 0.4, 0.0)], "standard", names=["a", "b"])
+    model = mujoco.MjModel.from_xml_string(mjcf_text(wrong(robot)))
+    assert {"a", "b"} <= {model.body(number).name for number in range(model.nbody)}
+
+
+def test_what_mjcf_cannot_hold_is_refused() -> None:
+    joints = [Joint(name, "revolute", torch.eye(4, dtype=torch.float64)) for name in "ab"]
+    both = replace(joints[0], name="c", mimic={"a": 1.0, "b": 2.0})
+    with pytest.raises(InputError, match="mimic joint 'c'"):
+        mjcf_text(wrong(Chain("robot", "base", "tip", [*joints, both])))
+    arm = SimulatedArm(seed=0).nominal
+    with pytest.raises(InputError, match="not above"):
+        mjcf_text(wrong(arm.reversed()))
+    alone = replace(joints[0], name="d", mimic={"elsewhere": 1.0})
+    beside = Joint("elsewhere", "revolute", torch.eye(4, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"mimic joint 'd'.*elsewhere"):
+        mjcf_text(wrong(Chain("robot", "base", "tip", [*joints, alone], drivers=[beside])))

@@ -13,32 +13,15 @@ from table_bank import random_poses, refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import judge
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.evaluation import (
     joints_outside_range,
-    place,
     refuse_other_angles,
-    residuals,
     rows_used_in_fit,
     warn_outside_range,
 )
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 from diffeo_calib.measurements.rows import with_attributes
-
-
-@pytest.mark.parametrize(("rows", "markers"), [(1, 1), (7, 3), (200, 2)])
-def test_numbers_are_numpy_s(rows: int, markers: int) -> None:
-    rng = np.random.default_rng(rows)
-    q, points = rng.normal(size=(rows, 2)), rng.normal(size=(rows, markers, 3))
-    predicted = points + 1e-3 * rng.normal(size=points.shape) * rng.exponential(size=(rows, markers, 1))
-    distances = np.linalg.norm(predicted - points, axis=-1)
-    found = dc.evaluate(lambda _: torch.from_numpy(predicted), dc.Measurements(q, points))
-    np.testing.assert_allclose(found.errors.numpy(), distances, rtol=1e-12)
-    assert found.rms == pytest.approx(float(np.sqrt(np.mean(distances**2))), rel=1e-12)
-    assert found.mean == pytest.approx(float(np.mean(distances)), rel=1e-12)
-    for value, share in ((found.median, 0.5), (found.p95, 0.95), (found.max, 1.0), (found.quantile(0.25), 0.25)):
-        assert value == pytest.approx(float(np.quantile(distances, share)), rel=1e-12)
 
 
 def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
@@ -60,11 +43,12 @@ def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, size: fl
     np.testing.assert_allclose(found.errors.numpy(), distances[:, None], rtol=1e-6, atol=1e-15)
     assert found.angles is not None
     np.testing.assert_allclose(found.angles.numpy(), np.radians(degrees), rtol=1e-6, atol=1e-15)
-    assert found.rms == pytest.approx(float(np.sqrt(np.mean(distances**2))), rel=1e-6, abs=1e-15)
-    turned = found.orientation
-    assert turned.rms == pytest.approx(float(np.sqrt(np.mean(degrees**2))), rel=1e-6, abs=1e-13)
-    for value, share in ((turned.median, 0.5), (turned.p95, 0.95), (turned.max, 1.0), (turned.quantile(0.25), 0.25)):
-        assert value == pytest.approx(float(np.quantile(degrees, share)), rel=1e-6, abs=1e-13)
+    for judged, values, floor in ((found, distances, 1e-15), (found.orientation, degrees, 1e-13)):
+        assert judged.rms == pytest.approx(float(np.sqrt(np.mean(values**2))), rel=1e-6, abs=floor)
+        shares = ((judged.median, 0.5), (judged.p95, 0.95), (judged.max, 1.0), (judged.quantile(0.25), 0.25))
+        for value, share in shares:
+            assert value == pytest.approx(float(np.quantile(values, share)), rel=1e-6, abs=floor)
+    assert found.mean == pytest.approx(float(np.mean(distances)), rel=1e-6, abs=1e-15)
 
 
 def test_predictions_that_do_not_fit_the_rows(posed: Case, arm: Case) -> None:
@@ -133,19 +117,6 @@ def test_rows_in_another_unit_of_angles_are_named(name: str, factor: float, unit
     for verb in (dc.evaluate, dc.CalibratedKinematics.registered, dc.recalibrate, dc.compare):
         with pytest.raises((MeasurementError, dc.DiffeoCalibWarning), match=words):
             verb(kind.model, in_other_unit(kind.new, factor))
-
-
-@pytest.mark.slow
-def test_what_is_wrong_with_all_rows_is_named_by_positions_then_by_readings() -> None:
-    several, sockets = kind_named("several kinds"), kind_named("ball in sockets")
-    parts = [with_attributes(part, q=torch.cat([part.q[:3], part.q[4:], part.q[3:4]])) for part in several.data.parts]
-    rows = dc.Observations(parts, several.data.index)
-    places = place(several.model, rows)
-    text = judge(several.model, places, rows, residuals(several.model, places, rows)).refusal or ""
-    assert text.startswith("from line 4 on the measured values belong to the joints 1 line above")
-    order = torch.randperm(len(sockets.data), generator=torch.Generator().manual_seed(0))
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"mm at the ball; check the joint values, and the socket of every"):
-        dc.evaluate(sockets.model, with_attributes(sockets.data, q=sockets.data.q[order]))
 
 
 def test_what_is_not_taken_for_another_unit(arm: Case) -> None:

@@ -16,9 +16,6 @@ from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.robots import Chain, Geometry, Joint, from_dh
 from diffeo_calib.robots.gravity import GravitySag
 
-# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-
 
 @pytest.fixture
 def chain() -> Chain:

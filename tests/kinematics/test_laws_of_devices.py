@@ -1,13 +1,11 @@
 """Laws of devices of every kind, those of scripts/examples too, and of set-ups: exact readings, slopes, carrying."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from inclinometer import AXES, Inclinometers
-from kind_bank import kind_named, marked
 from laser_line import DIRECTIONS, POINTS, Beams
 from math_bank import normal
 from product_bank import Case
@@ -17,9 +15,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.kinematics.hand_eye import HandEye, SetUp
 from diffeo_calib.measurements.bodies import triple
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import LEVER
@@ -341,42 +338,3 @@ def test_frames_that_are_found_in_rows_of_known_ones_lead_on_from_these() -> Non
     for number in range(2):
         there = first.view(number, second.view(number, TIPS))
         assert_close(second.after(first).view(number, TIPS), there)
-
-
-def changes(pose: Callable[[Tensor], Tensor], count: int) -> Tensor:
-    """(6, count) shift and turn of a pose, along the axes of its frame, by unit steps."""
-    columns = []
-    for step in STEP * torch.eye(count, dtype=torch.float64):
-        ahead, behind = pose(step), pose(-step)
-        turn = ahead[:3, :3] @ behind[:3, :3].mT
-        small = 0.5 * torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        columns.append(torch.cat([(ahead - behind)[:3, 3], small]) / (2 * STEP))
-    return torch.stack(columns, 1)
-
-
-@pytest.mark.parametrize("name", marked("two cameras", "two cameras on the tool"))
-def test_covariances_are_those_of_small_changes(name: str) -> None:
-    """Also of the camera whose frame or place on the tool is not the model's: shifts of the fit move it."""
-    model, on_tool = kind_named(name).model, "on the tool" in name
-    g, fitted, lever = model.geometry, model.map, model.bodies.pose_lever()
-    for camera in HandEye.of_each(model, camera_on_tool=on_tool):
-        own, found = SetUp.of(model, camera), HandEye.of(model, camera_on_tool=on_tool, camera=camera)
-        carried, standing = (found.camera, found.board) if on_tool else (found.board, found.camera)
-        shifts = own.columns.nonzero()[:, 0]
-
-        def poses(step: Tensor, own: SetUp = own) -> tuple[Tensor, Tensor]:
-            theta, moved = step.split([g.size, own.of_mount.shape[1]])
-            after = g.absorb(theta)
-            mount, frame = twist_transform(own.of_mount @ moved) @ own.mount, twist_transform(own.of_frame @ moved)
-            standing = torch.linalg.inv(own.transform @ frame @ after.base)
-            return poses_from_marks(after.tool[None], lever)[0] @ mount, standing
-
-        for number, (known, part) in enumerate(((carried, "tool"), (standing, "base"))):
-            numbers = torch.arange(g.size)[g.slices[part]]
-            J = changes(lambda step, number=number: poses(step)[number], g.size + len(shifts))
-            which = torch.cat([numbers, len(fitted.geodesic.spec.prior_variance) + shifts])
-            J = J[:, torch.cat([numbers, g.size + torch.arange(len(shifts))])]
-            left = J[:, : len(numbers)] @ fitted.open_directions[numbers]
-            expected = J @ fitted.parameter_covariance(which) @ J.mT + left @ left.mT
-            size = known.deviations[:, None] * known.deviations
-            torch.testing.assert_close(known.covariance / size, expected / size, rtol=0, atol=0.02)

@@ -86,7 +86,7 @@ def test_everything_is_drawn_and_readable(opened: Any) -> None:
     assert min(opened.evaluate(SVG_TEXT)) > 8.0
 
 
-def test_the_scene_turns_by_keys_and_buttons_and_says_what_it_shows(opened: Any) -> None:
+def test_the_scene_turns_every_control_is_reached_by_the_keyboard_and_it_prints(opened: Any, tmp_path: Path) -> None:
     def pixels() -> str:
         return opened.evaluate("document.querySelector('canvas').toDataURL()")
 
@@ -108,9 +108,7 @@ def test_the_scene_turns_by_keys_and_buttons_and_says_what_it_shows(opened: Any)
     canvas = opened.locator("canvas")
     canvas.drag_to(canvas, source_position={"x": 100, "y": 100}, target_position={"x": 180, "y": 120})
     opened.wait_for_function("before => document.querySelector('canvas').toDataURL() !== before", arg=before)
-
-
-def test_every_control_is_reached_by_the_keyboard(opened: Any) -> None:
+    opened.evaluate("document.activeElement.blur()")
     wanted = opened.evaluate("document.querySelectorAll('a[href], button, canvas, [tabindex=\"0\"]').length")
     reached = set()
     for _ in range(wanted + 2):
@@ -118,9 +116,6 @@ def test_every_control_is_reached_by_the_keyboard(opened: Any) -> None:
         controls = "[...document.querySelectorAll('a, button, [tabindex]')]"
         reached.add(opened.evaluate(f"{controls}.indexOf(document.activeElement)"))
     assert len(reached - {-1}) == wanted
-
-
-def test_it_prints(opened: Any, tmp_path: Path) -> None:
     opened.pdf(path=tmp_path / "report.pdf", format="A4")
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     opened.emulate_media(media="print")

@@ -69,14 +69,6 @@ def test_reach_counts_strokes_and_follows_from_the_limits_of_drivers(joints: lis
     assert Chain("r", "a", "b", joints).reach == reach
 
 
-@pytest.mark.parametrize("shape", [(3, 5), (4,), (2, 3, 4)])
-def test_wrong_shape_of_q_is_explained(crooked: Chain, shape: tuple[int, ...]) -> None:
-    message = f"`q` must have shape (N, 4) for robot 'crooked': got {shape}; pass the 4 joints in the order of `robot."
-    for call in (crooked, crooked.jacobian, crooked.joint_frames):
-        with pytest.raises(InputError, match=re.escape(message)):
-            call(torch.zeros(shape))
-
-
 def bad_origin(entry: float, row: int, column: int) -> torch.Tensor:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[row, column] = entry

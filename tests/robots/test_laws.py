@@ -1,4 +1,4 @@
-"""Laws of every robot: poses of pinocchio, exact derivatives, descriptions that come back, the view from its tip."""
+"""Laws of every robot: poses of pinocchio, exact derivatives, descriptions, views from its tip, gravity, payloads."""
 
 import json
 from math import pi
@@ -11,6 +11,7 @@ import torch
 from deformation_bank import errors_of, geometry_of
 from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
+from table_bank import refused
 from torch import Tensor
 from torch.func import jacfwd, jacrev, vmap
 from torch.testing import assert_close
@@ -18,14 +19,21 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.robots import DHRow, SimulatedArm, from_dh, load_urdf
+from diffeo_calib.robots import (
+    Chain,
+    DHRow,
+    Geometry,
+    Joint,
+    SimulatedArm,
+    from_dh,
+    load_urdf,
+    simulated_arm,
+    with_load,
+)
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import Ends, Tree, robot_from_config
-
-# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 VIEWS = {
     "both hands": ("pelvis", [*HANDS], []),
@@ -88,12 +96,9 @@ def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, r
 
 
 def test_shapes_of_one_tip_and_of_several(tmp_path: Path) -> None:
-    both, left = BODY["both hands"], BODY["one hand, the other as load"]
-    q = draw(3, both.n)
-    assert both(q).shape == (3, 2, 4, 4)
-    assert both.jacobian(q).shape == (3, 2, 6, 17)
-    assert left(q).shape == (3, 4, 4)
-    assert left.jacobian(q).shape == (3, 6, 17)
+    both, left, q = BODY["both hands"], BODY["one hand, the other as load"], draw(3, 17)
+    for robot, tips in ((both, (2,)), (left, ())):
+        assert (robot(q).shape, robot.jacobian(q).shape) == ((3, *tips, 4, 4), (3, *tips, 6, 17))
     assert_close(both(q)[:, 0], left(q), rtol=0, atol=0)
     bracket = '<link name="b"/><joint name="f" type="fixed"><parent link="chest"/><child link="b"/></joint></robot>'
     before, joint, after = URDF_FILE.read_text(encoding="utf-8").partition('"right_shoulder_pitch" type="revolute">')
@@ -154,16 +159,12 @@ def test_jacobians_are_derivatives_and_descriptions_come_back(robot: Tree) -> No
     assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
 
 
-def laden(robot: Tree) -> GeometryMap:
-    """Elastic, with waves and crooked axes, and with a weight at its last end."""
-    payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
-    return GeometryMap(geometry_of(robot), elastic=True, own=errors_of(robot), payload=payload)
-
-
 @every_robot
 @pytest.mark.parametrize("size", [1e-9, 0.5])
 def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: float) -> None:
-    nominal = laden(robot)
+    """Elastic, with waves and crooked axes, and with a weight at its last end."""
+    payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
+    nominal = GeometryMap(geometry_of(robot), elastic=True, own=errors_of(robot), payload=payload)
     q, theta = draw(3, robot.n), draw(nominal.parameters, seed=14, size=size)
     by_joint = vmap(jacrev(lambda row: nominal(row[None], theta)[0]))(q)
     assert_close(nominal.jacobian(q, theta), by_joint, rtol=1e-11, atol=1e-12)
@@ -249,3 +250,103 @@ def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:
     for tip in (None, "middle"):
         with pytest.raises(RobotError, match=r"`tip`: expected one of left_hand, right_hand"):
             both.reversed(tip)
+
+
+@every_chain
+def test_merged_places_lose_nothing(chain: Chain) -> None:
+    """The moment of a weight at any frame beyond a joint is in the span of the joint's features."""
+    sag, q = GravitySag(chain), draw(60, chain.n)
+    frames = chain.joint_frames(q)
+    at = torch.cat([frames[..., :3, 3], chain(q)[:, None, :3, 3]], dim=1)
+    parts = sag.features(q).split([compliance.size for compliance in sag.compliances], 1)
+    for compliance, used in zip(sag.compliances, parts, strict=True):
+        e = frames[:, compliance.joint, :3, :3] @ torch.from_numpy(compliance.axis)
+        for place in range(compliance.joint + 1, chain.moving + 1) if compliance.places else ():
+            arm = at[:, place] - at[:, compliance.joint]
+            moment = (e * torch.linalg.cross(arm, draw(3, seed=place).expand_as(arm))).sum(1, keepdim=True)
+            explained = used @ torch.linalg.lstsq(used, moment, driver="gelsd").solution
+            assert float((explained - moment).abs().max()) < 1e-12
+
+
+def test_where_sag_and_payloads_are_not() -> None:
+    """All joints turn about the tip; a slide on another branch; payloads that cannot be."""
+    joints = [Joint("a", "revolute", torch.eye(4)), Joint("b", "revolute", torch.eye(4), torch.tensor([1.0, 0, 0]))]
+    chain = Chain("ball", "floor", "hand", joints)
+    sag = GravitySag(chain)
+    assert sag.compliances == ()
+    assert sag.size == len(sag.joints) == len(sag.own) == 0
+    assert GeometryMap(Geometry.nominal(chain), elastic=True).parameters == Geometry.nominal(chain).size
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
+    robot = from_dh(rows)
+    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
+        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+        assert set(sag.joints[sag.loaded].tolist()) == joints
+    robot = SimulatedArm(0).nominal
+    refused(
+        ("all payloads are 0", lambda: Payload.of_rows(robot, 0.0 * MASSES, None)),
+        ("the link of the payload", lambda: Payload.of_rows(robot, MASSES, "nowhere")),
+    )
+    assert not Payload.of_rows(robot, None, None)
+
+
+MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)
+UNIT = 5.0
+
+
+def laden(robot: Tree, masses: Tensor = MASSES, link: str | None = None) -> GravitySag:
+    return GravitySag(robot, Payload(link or robot.tips[0], masses, UNIT))
+
+
+ONE_HAND = "one hand, the other as load"
+PLACES = [
+    *((chain, chain.tip) for chain in CHAINS.values()),
+    (BODY[ONE_HAND], "left_hand"),
+    (BODY[ONE_HAND], "right_hand"),
+]
+
+
+@pytest.mark.parametrize(("robot", "link"), PLACES, ids=[*CHAINS, "body", "branch of a body"])
+def test_one_payload_is_one_of_the_unknown_masses(robot: Tree, link: str) -> None:
+    """Folded into the coefficients without payload, it bends the robot as before: all joints that carry it."""
+    q, sag = draw(6, robot.n), laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+    w = draw(sag.size, seed=2)
+    expected = GravitySag(robot).twists(q, sag.folded(w))
+    torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
+    bent = sag.twists(q, torch.where(sag.loaded, w, 0.0)).abs().amax((0, 2)) > 0
+    carrying = robot.ancestors[robot.moving + list(robot.ends).index(link)]
+    assert not bool((bent & ~carrying).any())
+    if robot is BODY[ONE_HAND]:
+        assert bool(bent[carrying].all())
+
+
+def test_masses_are_counted_in_units() -> None:
+    """Coefficients are sags under one unit, whatever the unit of mass is."""
+    robot, q = SimulatedArm().nominal, draw(len(MASSES), 6)
+    w = draw(laden(robot).size, seed=2)
+    in_grams = GravitySag(robot, Payload(robot.tips[0], 1e3 * MASSES, 1e3 * UNIT))
+    torch.testing.assert_close(in_grams.twists(q, w), laden(robot).twists(q, w))
+    assert Payload(robot.tips[0], MASSES, UNIT).amounts(q)[:, 0].tolist() == [0.0, 0.4, 1.0, 1.0, 0.3]
+    with pytest.raises(InputError, match="payloads of 5 rows: expected one for each, got 3 configurations"):
+        laden(robot).features(q[:3])
+    with pytest.raises(InputError, match="a payload of every row"):
+        laden(robot).folded(w)
+
+
+def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
+    """Masses of every row differ; one set of coefficients explains all of their torques."""
+    arm = SimulatedArm(seed=3)
+    robot = with_load(arm.nominal, "box", simulated_arm.PAYLOAD_CENTRE)
+    assert (robot.tips, robot.loads) == (("flange",), ("box",))
+    q, masses = arm.sample(100), torch.linspace(0.0, 9.0, 100, dtype=torch.float64)
+    assert robot(q).equal(arm.nominal(q))
+    torques = arm.gravity_torques(q, masses) - arm.gravity_torques(q, 0.0)
+    assert float(torques.abs().amax(0)[1:5].min()) > 1.0
+    for link, least, most in (("box", 0.0, 1e-11), ("flange", 0.1, 10.0)):
+        sag, away = laden(robot, masses, link), []
+        for joint in range(6):
+            used, own = sag.features(q)[:, sag.loaded & sag.own & (sag.joints == joint)], torques[:, [joint]]
+            away.append(float((used @ torch.linalg.lstsq(used, own, driver="gelsd").solution - own).abs().max()))
+        assert least <= max(away) < most
+    for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
+        with pytest.raises(RobotError, match=words):
+            with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
