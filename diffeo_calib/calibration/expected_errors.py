@@ -83,7 +83,8 @@ class ExpectedError:
         shown, bare, some = _shown(model), fitted.unregistered, _some_rows(fitted.x)
 
         def rms(covariance: Tensor) -> float:
-            return _distance(shown @ covariance @ shown.mT)
+            points = shown @ covariance @ shown.mT  # (M, 3 P, 3 P)
+            return float((3 * points.diagonal(dim1=1, dim2=2).mean()).clamp(min=0).sqrt())
 
         points, at = bare.geodesic.linearised_value(q)
         away = points[:, -3:] - points[:, -3:].mean(0)
@@ -158,11 +159,6 @@ def _shown(model: CalibratedKinematics) -> Tensor:
     every = model.bodies.averaging(model.map.new_noise)
     by_device = device_coordinates(model.map.m, ball=model.ball, free=stands_free(model))
     return every[-3:] if by_device < model.map.m else every
-
-
-def _distance(covariance: Tensor) -> float:
-    """Root mean square distance, m, of covariances (M, 3 P, 3 P), m^2."""
-    return float((3 * covariance.diagonal(dim1=1, dim2=2).mean()).clamp(min=0).sqrt())
 
 
 def _some_rows(x: Tensor) -> Tensor:

@@ -60,11 +60,11 @@ class GeodesicDeformation(Deformation):
 
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
-        return torch.cat([self._values(x[rows], self.spec.nominal.rows(rows)) for rows in row_blocks(x)])
-
-    def _values(self, x: Tensor, nominal: NominalMap) -> Tensor:
-        z0 = nominal(self.joint_flow(x), self.momenta.theta)
-        return self.task_flow(self._points(z0)).reshape(z0.shape)
+        values = list[Tensor]()
+        for rows in row_blocks(x):
+            z0 = self.spec.nominal.rows(rows)(self.joint_flow(x[rows]), self.momenta.theta)
+            values.append(self.task_flow(self._points(z0)).reshape(z0.shape))
+        return torch.cat(values)
 
     def at_controls(self, x: Tensor) -> Tensor | None:
         same = self.spec.nominal is self._nominal_of_z1 and x.device == self.x.device and torch.equal(x, self.x)

@@ -31,7 +31,7 @@ FREEDOM_CENTRE, FREEDOM_EFOLDS = 4.0, 2.0
 deviation of log nu; wide, since a handful of errors hardly determines the tails."""
 SMALLEST_FREEDOM, GAUSSIAN_FREEDOM = 2.0, 100.0
 """Bound below which the variance would be infinite, and nu from which noise counts as Gaussian."""
-WEIGHT_CHANGE = 0.01
+WEIGHT_CHANGE = 0.02
 """Largest relative change of a weight at which it has converged: gross errors make all weights small at first."""
 FREEDOM_GRID_POINTS = 400  # points of the logarithmic grid of nu: steps of one percent
 

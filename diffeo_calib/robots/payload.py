@@ -130,13 +130,6 @@ def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
         raise MeasurementError.of(what, expected="no payloads", got="a column of masses", fix=fix)
 
 
-def common_mass(first: float | None, second: float | None) -> float | None:
-    """The mass under which two models are compared: that of the first, 0 where one knows of none; None for neither."""
-    if first is None and second is None:
-        return None
-    return 0.0 if first is None or second is None else first
-
-
 def under_mass(model: Any, mass: float | None) -> Any:
     """A model that carries a mass; unchanged if it knows of no payload."""
     return model if model.payload is None else model.with_payload(mass)

@@ -12,6 +12,7 @@ import torch
 from command_bank import FORMAT, POSITION, STAGES, TABLE, Command, Outcome, Site
 from export_bank import own_poses
 from kind_bank import table_rows
+from numbers_bank import normal
 from product_bank import Case, simulated
 from torch import Tensor
 
@@ -55,6 +56,19 @@ def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: 
     assert "1 of 20 training rows look wrong (numbers are lines of the file); none was dropped:\n  row 9: " in done.out
     assert (loaded.report["rows"], loaded.report["outliers"]) == (20, 1)
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
+
+
+@pytest.mark.usefixtures("given_scales")
+def test_rows_along_motions_say_little_of_other_places(site: Site, command: Command, tmp_path: Path) -> None:
+    q, model = site.arm.sample(10, seed=3), tmp_path / "motions.safetensors"
+    steps = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
+    q = torch.cat([start + steps * (end - start) for start, end in zip(q[::2], q[1::2], strict=True)])
+    points = site.arm.true_points(q) + 2e-5 * normal(len(q), 1, 3)
+    data = dc.Measurements(q, points, site.arm.nominal.joint_names)
+    write_measurements(table := tmp_path / "t.csv", data, FORMAT, position=POSITION.split(","))
+    _, said, *others = command.ran(*site.fit(table, model)).out.splitlines()
+    expected = next(line for line in others if "over the joint ranges of the fit" in line).split(": ")[1].split(";")[0]
+    assert said == f"these lie along 5 motions, beside fitted rows: over the joint ranges expect {expected}"
 
 
 @pytest.mark.usefixtures("given_scales")

@@ -61,7 +61,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
-from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
+from diffeo_calib.robots.payload import under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import mounted_of
 from diffeo_calib.sensors.errors import Evaluations
@@ -337,7 +337,8 @@ def compare(
         check_arguments(model, other, marker)
         rows = weighed(place_again(model, other, marker), marker, opens=True)
     else:
-        payload = common_mass(model.payload, other.payload)
+        masses = model.payload, other.payload
+        payload = None if masses == (None, None) else 0.0 if None in masses else masses[0]  # the first one's
         model = under_mass(model, payload).to(HOST)
         rows = _predicted_rows(model, under_mass(other, payload).to(HOST))
     changes, _ = find_changes(rows, level=level, seed=seed)

@@ -177,6 +177,8 @@ def cross_validated_inflation(
     new[chosen] = centre is None
     rows, data = data.sample(len(data.x), MOST_COORDINATES, seed)
     numbers, new = motions(data.x, groups[rows]), new[rows]
+    if int(numbers.max()) + 1 < FEWEST_MOTIONS:
+        numbers = groups[rows].unique(return_inverse=True)[1]
     if centre is None or len(numbers[new].unique()) >= FEWEST_OUTSIDE:
         part = torch.where(torch.isin(numbers, numbers[new]), numbers, -1)
         squares = left_out_rows(data, scales, part, data.noise_of_new_rows(scales))[1]
@@ -279,5 +281,4 @@ def motions(x: Tensor, groups: Tensor) -> Tensor:
         for together in (groups, runs):
             lowest = labels.new_full((int(together.max()) + 1,), len(x))
             labels = lowest.scatter_reduce(0, together, labels, "amin")[together]
-    numbers = labels.unique(return_inverse=True)[1]
-    return numbers if int(numbers.max()) + 1 >= FEWEST_MOTIONS else groups.unique(return_inverse=True)[1]
+    return labels.unique(return_inverse=True)[1]

@@ -13,6 +13,7 @@ from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, check_errors, contradicted, outlier_lines
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
+from diffeo_calib.calibration.scales.leave_one_out import motions
 from diffeo_calib.cli import console, models
 from diffeo_calib.cli.declarations import DemoOptions, FitOptions
 from diffeo_calib.cli.main import app
@@ -32,6 +33,8 @@ from diffeo_calib.sensors.kinds import divided
 
 EXIT_UNCONVERGED = 3
 LARGE_SHARE = 0.5  # of the expected error, from which the robot's size is said to be worth measuring
+FLATTERED, ROWS_EACH = 2.0, 3
+"""Times the held-out error that is expected elsewhere, and poses of a motion, from which held-out rows flatter."""
 
 Errors = dict[str, dict[str, Evaluation]]  # errors by the kind of rows and by stage
 
@@ -60,7 +63,7 @@ def run(given: FitOptions) -> None:
         console.record.add(**({"hand_eyes": each} if len(each) > 1 else {"hand_eye": each.popitem()[1]}))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
-    console.say(*_verdict(result, judged), *(() if test is None else train.place_lines(test)))
+    console.say(*_verdict(result, judged, data), *(() if test is None else train.place_lines(test)))
     _show_errors(result, in_train, None if test is None else held_out)
     waves, outliers = (wave.sentence for wave in result.gear_lines), outlier_lines(result.outliers, len(train))
     console.say(*waves, *outliers, result.status)
@@ -85,12 +88,17 @@ def _of_positions(errors: Errors) -> list[dict[str, Evaluation]]:
     return [stages for stages in errors.values() if stages[CALIBRATED].what == ERRORS]
 
 
-def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:
+def _verdict(result: CalibrationResult, judged: list[Any], data: Any) -> Iterator[str]:
     """How accurate the robot is now, first of all: by measured positions, or by what the model expects."""
     for stage in judged:
         geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
         rms, most, before = (f"{1e3 * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
         yield f"held out: {rms} mm RMS, 95 % below {most} ({model.count} rows; geometry alone {before} mm RMS)"
+        groups, expected = data.groups(), result.expected.workspace
+        count = int(motions(data.q, groups).max()) + 1
+        if expected > FLATTERED * model.rms and ROWS_EACH * count <= int(groups.max()) + 1:
+            words = f"these lie along {count} motions, beside fitted rows"
+            yield f"{words}: over the joint ranges expect {1e3 * expected:.3f} mm RMS"
     if not judged:
         yield models.stage_line(result.model, result.stages, result.expected)
 
