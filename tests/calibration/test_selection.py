@@ -331,8 +331,6 @@ def test_rows_along_motions_and_repeats_belong_together() -> None:
     assert found[:40].view(8, 5).unique(dim=1).shape == (8, 1)
     assert len(found.unique()) == 38
     assert found[-1] == found[0]
-    few = motions(along[:20], torch.arange(20))  # four motions are too few to leave one out
-    assert len(few.unique()) == 20
     folds = random_folds(found, 5, 0)
     assert sorted(torch.cat([within for _, within in folds]).tolist()) == list(range(71))
     for outside, within in folds:
@@ -356,6 +354,12 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, of_scales(data, factor, seed), rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
+    four, each = (  # four motions are too few to leave one out
+        monkeypatch.setattr(one_out, "motions", lambda _, groups, size=size: groups // size)
+        or cross_validated_inflation(scales, scales, of_scales(data, factor, 0), rows, seed=0)
+        for size in (7, 1)
+    )
+    assert four == each == found[0]
 
 
 def machine(rows: int) -> TangentData:
