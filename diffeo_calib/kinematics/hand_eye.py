@@ -7,7 +7,8 @@ is a session, whose frame is known from that of the model: their errors and thos
 
 What errors of a machine with commanded poses have in common in all rows is a base, or a tool, elsewhere: no row tells
 them apart. An arm that is wrong by a joint's zero or a link's length errs by more on average than it varies over the
-rows, and a field of zero mean does not expect that. So a motion of all poses is added, as large as the field says.
+rows, and a field of zero mean does not expect that. So a motion of all poses is added, as large as the machine's errors
+are that its fields do not resolve: those of such arms change with joints, too fast for fields over poses.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import own_shifts
 from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
-from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
+from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import nearest_rotations, twist_at
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
 IN_TIP = "in_tip"
-COMMON = torch.tensor([[1.6, 0.8], [3.0, 9.0]], dtype=torch.float64, device="cpu")
-"""Variances of shift and turn that all poses share, at base and tip, relative to those of the slopes along three axes:
-95 % of those of 250 random arms, with errors of joint zeros, or of links too, and 15 to 40 poses lie within."""
-SMALLEST = 1e-24  # m^2 and rad^2, mean square of the field of a perfect machine
+COMMON = torch.tensor([[4.0, 4.0], [1.0, 2.25]], dtype=torch.float64, device="cpu")
+"""Variances of shift and turn that all poses share, at base and tip, relative to the size of a machine's errors and to
+that over its reach: of arms with wrong zeros, or links too, 95 % of regions by 20 poses hold."""
+SMOOTH = 0.02  # share of the fields' variances in that size
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,31 +206,14 @@ class SetUp(NamedTuple):
 
 
 def _common_motions(model: CalibratedKinematics, geometry: Geometry) -> tuple[Tensor, Tensor]:
-    """Variances (2, 6) of what all poses share at base and tip, m^2 and rad^2; (3,) the middle of all in the base, m.
-
-    The slopes of the field by the flange's place, over its distance from the base, and by its turn, are a ridge
-    regression with variances as large as the field and their spread allow.
-    """
-    lever, x, R = model.bodies.pose_lever(), model.map.x, geometry.base[:3, :3]
-    rigid, flange = geometry.points(x), geometry.chain.tip_poses(x).view(-1, 4, 4)
-    tools, away = poses_from_marks(rigid, lever), model.map.fitted_points - rigid.flatten(1)
-    shift, turn = (pose_directions(tools, lever) @ away[:, :, None])[:, :, 0].split(3, 1)
-    shift = shift + torch.linalg.cross(turn, flange[:, :3, 3] @ R.mT + geometry.base[:3, 3] - tools[:, :3, 3])
-    errors, middle, turns = torch.cat([shift @ R, turn @ R], 1), flange[:, :3, 3].mean(0), flange[:, :3, :3]
-    places = flange[:, :3, 3] - middle
-    radius = torch.maximum(middle.norm(), places.square().sum(1).mean().sqrt())
-    rotvec = rotation_numbers(nearest_rotations(turns.mean(0)).mT @ turns, "rotvec")
-    along = torch.stack([places / radius, rotvec], 1)  # (M, 2, 3)
-    size = errors.unflatten(1, (2, 3)).square().mean((0, 2)).clamp(min=SMALLEST).sqrt().repeat_interleave(3)
-    by_base = torch.stack([twist_at(place) for place in places])
-    by_tip = torch.kron(torch.eye(2, dtype=x.dtype, device=x.device), turns)
-    motions = torch.stack([by_base, by_tip], 2) * size / size[:, None, None]  # (M, 6, 2, 6)
-    slopes = motions[:, :, :, None] * along[:, None, :, :, None]  # (M, 6, 2, 3, 6)
-    ridge = torch.cat([size.new_zeros(12), along.square().mean((0, 2)).sqrt().repeat_interleave(18)]).diag()
-    matrix = torch.cat([torch.cat([motions.flatten(2), slopes.flatten(2)], 2).flatten(0, 1), ridge])
-    target = torch.cat([(errors / size).flatten(), ridge.new_zeros(len(ridge))])
-    steep = torch.linalg.lstsq(matrix, target[:, None], driver="gelsd").solution[12:].view(2, 3, 2, 3)
-    return (COMMON.to(x) * steep.square().sum(1).mean(2)).repeat_interleave(3, 1) * size.square(), middle
+    """Variances (2, 6) of what all poses share at base and tip, m^2 and rad^2; (3,) their middle in the base, m."""
+    chain, places = geometry.chain, geometry.chain.tip_poses(model.map.x).view(-1, 4, 4)[:, :3, 3]
+    middle = places.mean(0)
+    reach = torch.maximum(middle.norm(), (places - middle).square().sum(1).mean().sqrt())
+    _, smooth, _, coupled, noise = model.scales.to(places)[: 5 * chain.n].view(5, chain.n).square()
+    errors, turning = noise + SMOOTH * (smooth + coupled), torch.tensor(chain.periodic)
+    size = errors[~turning].mean() + reach.square() * errors[turning].mean().nan_to_num()
+    return (COMMON.to(size) * torch.stack([size, size / reach.square()])).repeat_interleave(3, 1), middle
 
 
 def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:
