@@ -211,7 +211,8 @@ def _common_motions(model: CalibratedKinematics, geometry: Geometry) -> tuple[Te
     middle = places.mean(0)
     reach = torch.maximum(middle.norm(), (places - middle).square().sum(1).mean().sqrt())
     _, smooth, _, coupled, noise = model.scales.to(places)[: 5 * chain.n].view(5, chain.n).square()
-    errors, X
+    errors = noise + SMOOTH * (smooth + coupled)
+    turning = torch.tensor(chain.periodic, dtype=torch.bool, device=places.device)
     size = errors[~turning].mean() + reach.square() * errors[turning].mean().nan_to_num()
     return (COMMON.to(size) * torch.stack([size, size / reach.square()])).repeat_interleave(3, 1), middle
 
