@@ -25,7 +25,7 @@ else:  # what type checkers alone understand, and Python 3.10 does not have
 
 Kind = Literal["read", "write", "source", "later", "folder"]
 """A file must exist, is written, is written with a header beside it, may come later; or is a folder that is made."""
-Length = Literal["m", "mm", "cm", "inch"]
+Length = Literal["m", "mm", "cm", "um", "inch"]
 Angle = Literal["rad", "deg"]
 Convention = Literal["standard", "craig"]
 SHORT = {"output": "-o", "count": "-n"}

@@ -25,7 +25,13 @@ MAKERS = {"ur_rotvec": "rotvec", "abb_quaternion": "quat_wxyz", "kuka_abc": "ZYX
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
 LEVER = 0.1  # default distance [m] from a pose's origin to the three points that represent it: the size of usual tools
 ZERO = "0"  # in place of a column of z: all that was measured is in the plane of x and y
-UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}  # a length in a file is divided by this
+UNITS_PER_METRE = {
+    "m": 1.0,
+    "mm": 1e3,
+    "cm": 100.0,
+    "um": 1e6,
+    "inch": 1 / 0.0254,
+}  # a length in a file is divided by this
 ROTATION_NAMES = {
     "rotvec": ("rx", "ry", "rz"),
     "quat_xyzw": ("qx", "qy", "qz", "qw"),

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from math import pi
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -196,6 +197,12 @@ class Tree:
         same again: take measurements within one turn of such a joint.
         """
         return tuple(kind in ROTARY for kind in self.kinds)
+
+    def whole_turns(self, q: Tensor) -> Tensor:
+        """Whole turns [rad] by which values (N, n) of turning joints are away from the middle of their limits."""
+        away = (q - self.limits.mean(1).to(q.device)) / (2 * pi)
+        turns = torch.tensor(self.periodic, dtype=torch.bool, device=q.device) & away.isfinite()
+        return torch.where(turns, 2 * pi * away.round(), 0.0)
 
     @property
     def reach(self) -> float:

@@ -212,9 +212,12 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     measured = commanded + 1e-3 * (4 * commanded.flip(1)).sin() + 2e-5 * drawn(30, 2, seed=2)
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
     found, _ = init(table)
-    refused = init(write_columns(tmp_path / "um.csv", **{"cmdx_um|cmdy_um": 1e6 * commanded, "x|y": 1e3 * measured}))[1]
+    weighed = {"cmdx_kg|cmdy_kg": commanded, "x|y": 1e3 * measured}
+    refused = init(write_columns(tmp_path / "kg.csv", **weighed))[1]
+    in_um = {"cmdx_um|cmdy_um": 1e6 * commanded, "x|y": 1e3 * measured}
+    assert init(write_columns(tmp_path / "um.csv", **in_um))[0]["joint-length"] == "um"
     assert "got no other columns; if" in init(write_columns(tmp_path / "alone.csv", cmdx_cmdy=commanded))[1]
-    assert "cmdx_um, cmdy_um in um: expected m, mm, cm, inch; convert them" in refused
+    assert "cmdx_kg, cmdy_kg in kg: expected m, mm, cm, um, inch; convert them" in refused
     assert found["position"] == ["measx,measy,0"]
     assert (found["robot-pose"], found["length"]) == ("cmdx,cmdy", "mm")
     machine = PoseColumns(("cmdx", "cmdy"), robot=dc.cartesian(commanded))

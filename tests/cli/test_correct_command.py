@@ -143,8 +143,16 @@ def test_a_path_and_rows_that_miss(model: dc.CalibratedKinematics, program: Path
     change = np.diff(table(read(output), names) - table(read(program), names), axis=0)
     assert np.abs(change).max() <= 0.01 + 1e-9
     assert any("the corrections of the path jump" in line for line in done.warnings)
-    rows = read(program)
+    rows, first = read(program), read(output)
     names = [name for name in rows[0] if name not in ("line", "note")]
+    turned = [
+        {**row, names[1]: written(360.0 * (k % 3 - 1) + float(row[names[1]].replace(",", ".")))}
+        for k, row in enumerate(rows)
+    ]
+    write(program, turned)
+    done = command.ran("correct", program.with_name("model.safetensors"), program, *UNITS, "--rate", 0.01, "-o", output)
+    assert f"{names[1]}: whole turns beyond the limits were taken off" in done.out
+    np.testing.assert_allclose(table(read(output), names), table(first, names), rtol=0, atol=1e-6)
     rows[3][names[1]] = "900,0"
     write(program, rows)
     output, model = program.with_name("c"), program.with_name("model.safetensors")
@@ -201,6 +209,9 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
     assert misses["left"]["angle_miss_deg"] is None
     assert "6 rows: 6 reached" in done.out
     assert [row["miss_right_mm"] == "" for row in table_rows(output)] == empty
+    done = command.ran("correct", path, program, *UNITS_OF_HANDS, "--tip", "left", "-o", output)
+    assert "positions are corrected, without orientations: 5 joints cannot hold every orientation" in done.out
+    assert "angle_miss_rad" not in table_rows(output)[0]
     done = command.ran(*given)
     assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
     goals = arms.robot(torch.from_numpy(q)) @ torch.stack([tool_transform(place) for place in PLACES])

@@ -90,7 +90,7 @@ COMPLETED = {
     "diffeo-calib ": [*COMMANDS],
     "diffeo-calib pre": ["predict"],
     "diffeo-calib fit --ro": ["--robot", "--robot-pose", "--rotation", "--rotation-angle", "--rotation-std"],
-    "diffeo-calib fit --length ": ["m", "mm", "cm", "inch"],
+    "diffeo-calib fit --length ": ["m", "mm", "cm", "um", "inch"],
     "diffeo-calib --vers": ["--version"],
 }
 

@@ -108,7 +108,7 @@ def test_wrong_options(tmp_path: Path) -> None:
     geometry = wrong(EVERY["arm"])
     for options, message in (
         ({"convention": "khalil"}, "`convention`: expected 'standard' or 'craig', got 'khalil'"),
-        ({"length": "foot"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'foot'"),
+        ({"length": "foot"}, "`length`: expected 'm' or 'mm' or 'cm' or 'um' or 'inch', got 'foot'"),
         ({"angle": "grad"}, "`angle`: expected 'rad' or 'deg', got 'grad'"),
     ):
         with pytest.raises(InputError, match=message):

@@ -49,7 +49,7 @@ FILES: list[Case] = [
     (TABLE.replace("q1", "q1 [°]"), {"joints": ["q1 [°]", "q2"]}, "column 'q1 [°]': expected rad, as stated, got deg"),
 ]
 OPTIONS: list[Case] = [
-    (TABLE, {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
+    (TABLE, {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'um' or 'inch', got 'km'"),
     (TABLE, {"angle": "degrees"}, "`angle`: expected 'rad' or 'deg', got 'degrees'"),
     (TABLE, {"decimal": ","}, "`sep` and `decimal`: expected different ... sep=';'"),
     (TABLE, {"sep": "::"}, "`sep`: expected one character, got '::'"),

@@ -104,7 +104,7 @@ def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str) -> None:
         assert bool(said) == (kind in NOTES)
 
 
-@pytest.mark.parametrize(("length", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+@pytest.mark.parametrize(("length", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("um", 1e-6), ("inch", 0.0254)])
 def test_lengths_in_every_unit(length: str, metres: float, tmp_path: Path) -> None:
     np.save(tmp_path / "t.npy", ROWS / np.array([1, 1, metres, metres, metres]))
     data = warned(read_measurements, tmp_path / "t.npy", ["1", "2"], ["3", "4", "5"], length=length, angle="rad")[0]

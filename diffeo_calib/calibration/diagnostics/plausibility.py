@@ -78,8 +78,7 @@ def check_limits(robot: Tree, data: Any) -> None:
     """
     low, high = robot.limits.to(data.q.device).unbind(1)
     turns = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
-    away = data.q - (low + high) / 2
-    q = torch.where(turns, data.q - 2 * math.pi * (away / (2 * math.pi)).round(), data.q)
+    q = data.q - robot.whole_turns(data.q)
     least, most, margin = q.amin(0), q.amax(0), gates.LIMIT_EXCESS * (high - low)
     beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
     beyond = beyond & ~(turns & (data.q.abs().amax(0) > LARGEST_JOINT_ANGLE_RAD))

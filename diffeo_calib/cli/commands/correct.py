@@ -28,7 +28,8 @@ from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
-AXES_OF_A_POSE = 6
+AXES_OF_A_PLACE, AXES_OF_A_POSE = 3, 6
+SAME = 1e-9  # m, of poses a whole turn apart: joints that follow by another ratio are elsewhere
 ROWS_AT_ONCE = 100  # rows whose deviations are predicted together
 REASONS = {
     "unreachable": "unreachable with corrections within --limit",
@@ -114,11 +115,15 @@ def run(options: CorrectOptions) -> None:
         misses += ["status", tool.name("miss", table.length), tool.name("std", table.length)]
         sheet.check_free([*tool.pose_names(table), *misses])
     refuse_other_angles(model, start)
+    start = _within_limits(robot, start)
     warn_outside_range(model, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
-        if is_cartesian(robot) and robot.n < AXES_OF_A_POSE:  # commanded places
+        few = robot.n < AXES_OF_A_POSE * len(tools)
+        if few and (is_cartesian(robot) or robot.n >= AXES_OF_A_PLACE * len(tools)):
             targets = targets[..., :3, 3]
+            held = "" if is_cartesian(robot) else f": {robot.n} joints cannot hold every orientation"
+            say(f"positions are corrected, without orientations{held}")
     bound, rate = (None if angle is None else radians(angle) for angle in (options.limit, options.rate))
     how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
@@ -150,6 +155,17 @@ def _check(options: CorrectOptions) -> None:
     if options.frame == "measuring" and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
+
+
+def _within_limits(robot: Tree, start: Tensor) -> Tensor:
+    """Commands (N, n) less whole turns where these bring a joint within its limits, and the pose is the same."""
+    low, high = robot.limits.unbind(1)
+    inside = start - robot.whole_turns(start)
+    turned = ((start < low) | (start > high)) & (inside >= low) & (inside <= high)
+    turned &= (robot(torch.where(turned, inside, start)) - robot(start)).flatten(1).abs().amax(1, keepdim=True) < SAME
+    if names := [name for name, some in zip(robot.joint_names, turned.any(0).tolist(), strict=True) if some]:
+        say(f"{', '.join(names)}: whole turns beyond the limits were taken off")
+    return torch.where(turned, inside, start)
 
 
 def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableFormat) -> list[ToolOnTip]:

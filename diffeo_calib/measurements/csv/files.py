@@ -147,7 +147,7 @@ def read_measurements(
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
             sockets, or read by other devices. With ``socket`` a line has a position or a socket, and empty cells for
             the other, or is two rows.
-        length, angle: units in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``, and ``"rad"`` or ``"deg"``.
+        length, angle: units in the file, ``"m"``, ``"mm"``, ``"cm"``, ``"um"`` or ``"inch"``; ``"rad"`` or ``"deg"``.
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         columns: all else that the table says, as fields of :class:`TableFormat` (``sep``, ``decimal``, ``rotation``,
