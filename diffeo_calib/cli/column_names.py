@@ -52,6 +52,7 @@ GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "p
 GLUED |= {"d": "err", "e": "err", "s": "std"}
 """What stands before x, y or z in one word, and what it means."""
 AXES = {"east": "x", "easting": "x", "north": "y", "northing": "y", "up": "z"}
+SURVEYED = tuple("enh"), tuple("enu"), ("x", "y", "height"), ("x", "y", "elevation")
 SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_A-Za-z]+")
 LONGEST_LABEL = 6  # words of a name that are compared with one label
 
@@ -149,6 +150,15 @@ def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
 def whole(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
     """Columns that have all of the labels."""
     return (group for group in groups(names, labels) if len(group.names) == len(labels))
+
+
+def of_places(names: Sequence[str]) -> Iterator[Group]:
+    """The columns of each place by x, y and z: of a surveyed one east, north and height, or up."""
+    yield from whole(names, "xyz")
+    for group in (group for labels in SURVEYED for group in whole(names, labels)):
+        axes = dict(zip("xyz", group.names.values(), strict=True))
+        if "x" not in axes["x"].lower():  # beside x and y a height is a reading
+            yield group._replace(names=axes)
 
 
 def mixed_names(columns: Sequence[str], full: Sequence[str], bare: Sequence[str]) -> dict[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, mixed_names, whole
+from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, mixed_names, of_places, whole
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
@@ -52,6 +52,7 @@ ROTATIONS = (
     *(("euler1", "euler2", "euler3"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi")),
 )
 """Labels of the columns of a rotation: quaternions, matrices, rotation vectors and angles, by robots' makers too."""
+BY_NO_NAME = "all other columns, in their order"
 ENTRIES = [[row + k for row in index for k in index] for index in ("0123", "1234")]
 ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:12] for labels in ENTRIES]
 """Labels of the 16 numbers of a pose as a matrix: by row and column, without the last row too, or counted."""
@@ -79,6 +80,19 @@ class Sheet:
         """Column -> texts of all rows."""
         header, rows = read_cells(self.path, self.sep)
         return {name: [cells[k].strip() for _, cells in rows] for k, name in enumerate(header)}
+
+    def others(self, count: int) -> list[JointColumns]:
+        """So many columns of any names beside those of what was measured; of a rotation if there are too few."""
+        with suppress(InputError):
+            rows = rows_in(self, [])
+            taken = {rows.options[name] for name in NAMED} | {name for body in rows.bodies for name in body.place}
+            taken |= {name for names in guess_readings(self.numbers).values() for name in names}
+            turned = taken | {name for body in rows.bodies for name in body.turn}
+            for used in (turned, taken):
+                names = [name for name in self.numbers if name not in used and not _counts(self.cells[name])]
+                if len(names) == count:
+                    return [JointColumns(names, BY_NO_NAME, ())]
+        return []
 
     def joint_columns(self, joints: Sequence[str]) -> list[JointColumns]:
         """Series that may be the joints; constant columns, of axes that the URDF lacks, count only if needed."""
@@ -240,7 +254,7 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     three angles.
     """
     at = {name: offset for offset, name in enumerate(columns)}
-    places = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
+    places = [group for group in of_places(columns) if not group.says("rate", "deviation", "turn")]
     turns = [group for labels in ROTATIONS for group in _rotations(columns, labels)]
     pairs = list[tuple[tuple[int, ...], str, list[str]]]()
     for place, (rank, group) in product(places, enumerate(turns)):
@@ -371,13 +385,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     bodies = [Body(others[:3], [])] if nameless else [body for body in places if not body.left]
     bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others)
     if {f"{axis}{k}" for axis in "uv" for k in "1234"} <= {column(name).plain for name in others}:
-        expected, fix = (
-            f"a line for each, with {few([IMAGE, *POINT, *PIXEL])}",
-            "split the lines, as `images` writes them",
-        )
-        raise InputError.of(
-            f"corners in '{sheet.path}'", expected=expected, got="u1, v1, u2, v2, ... in a line", fix=fix
-        )
+        what, got = f"corners in '{sheet.path}'", "u1, v1, u2, v2, ... in a line"
+        expected = f"a line for each, with {few([IMAGE, *POINT, *PIXEL])}"
+        raise InputError.of(what, expected=expected, got=got, fix="split the lines, as `images` writes them")
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [group for group in whole(others, "xy") if not (group.wished or group.says("rate", "deviation"))]
         bodies = [Body([*group.names.values(), ZERO], []) for group in flat]

@@ -175,7 +175,8 @@ class Source:
         angles = ("rad", "deg") if any(periodic) else ("rad",)
         ways = next((body.spherical for body in self.bodies if body.spherical), ("",))
         places = [[body.written(way) for body in self.bodies] or None for way in ways]
-        each = product(lengths, angles, lengths if slides else [None], (False, True)[: 1 + self.options.images], places)
+        strokes = [unit for unit in lengths if unit != "um"]  # in which one would stand still
+        each = product(lengths, angles, strokes if slides else [None], (False, True)[: 1 + self.options.images], places)
         for length, angle, slide, camera, position in each:
             if slide != length:
                 values = zip(UNITS, (length, angle, slide, camera), strict=True)

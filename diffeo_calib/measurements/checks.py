@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from math import isnan
+from math import inf, isnan
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few
 
 LARGEST_JOINT_ANGLE_RAD = 4 * math.pi  # few axes turn further, so larger values are probably degrees
+SURVEYED = 2e-3  # share of their size, below which positions move far from zero, as those of a survey
 USUAL_SIZES = {
     "angles": (LARGEST_JOINT_ANGLE_RAD, 2 * math.pi),
     "rotations": (2 * math.pi + 0.01, 2 * math.pi),
@@ -68,6 +69,9 @@ def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_k
     """
     most, least = USUAL_SIZES[what]
     small, largest = unit in ("deg", "mm"), float(values.nan_to_num(0.0).abs().max()) if values.numel() else 0.0
+    if what == "positions" and not small and len(values) > 1:  # those of a survey are far from zero
+        moved = float((values.nan_to_num(-inf).amax(0) - values.nan_to_num(inf).amin(0)).max())
+        largest = moved if 0.0 < moved < SURVEYED * largest else largest
     if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]

@@ -38,7 +38,7 @@ class FixedPoints(Devices):
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
         """Columns of absolute lengths, and of those with an unknown zero."""
-        zero = "displacement", "wire", "draw_wire", "interferometer"
+        zero = "displacement", "wire", "draw_wire", "wire_length", "string_pot", "ballbar", "dbb", "interferometer"
         return {"distance": ("distance", "dist", "range", "bar"), "displacement": zero}
 
     @classmethod

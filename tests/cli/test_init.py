@@ -290,6 +290,34 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     assert '# length = "mm"  # the robot explains the rows in each' in text
 
 
+WORDS = ["Drehteller", "Schulter", "alpha", "beta", "gamma", "Flansch"]
+AWAY = torch.tensor([[512345.0, 5412345.0, 312.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("names", "per_deg", "joints", "axes", "away"),
+    [
+        (WORDS, 1.0, ",".join(WORDS), XYZ, 0.0),
+        (NAMES, 1.0, ",".join(NAMES), ["E", "N", "H"], 0.0),
+        (NAMES, 1.0, ",".join(NAMES), ["Easting", "Northing", "Height"], AWAY),
+        pytest.param(
+            *(NAMES, 1 / 360, ",".join(f"2*pi*{{{name}}}" for name in NAMES), XYZ, 0.0),
+            marks=pytest.mark.slow,
+            id="turns",
+        ),
+    ],
+)
+def test_other_names_places_and_turns(
+    names: list[str], per_deg: float, joints: str, axes: list[str], *, away: Any, proposed: Proposed
+) -> None:
+    """All other columns are the joints if there are as many; places of a survey are far from zero."""
+    q, points = rows()
+    found, text = proposed((names, per_deg * q), (axes, 1e-3 * points + away))
+    assert (found["joints"], found["length"], found["position"]) == (joints, "m", [",".join(axes)])
+    assert "all columns are used" in text
+    assert "look like millimetres" not in text
+
+
 @pytest.mark.slow
 def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
     q, points = rows()
@@ -302,7 +330,11 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
     assert done.code == 1
     assert f"the rows fit with --joints '{expected}'" in done.error
     q[:, 4] *= -1
-    found, text = proposed((NAMES, q), (XYZ, points))
+    found, _ = proposed((NAMES, q), (XYZ, points))
+    assert found["joints"] == f"{','.join(NAMES[:4])},-{{{NAMES[4]}}},{NAMES[5]}"  # by the limits
+    urdf = (tmp_path / "arm.urdf").read_text()
+    (tmp_path / "free.urdf").write_text(urdf.replace('"revolute"', '"continuous"'))
+    found, text = proposed((NAMES, q), (XYZ, points), robot="free.urdf")
     assert "joints" not in found
     lines = [line for line in text.splitlines() if line.startswith("# joints = ")]
     assert ["uncomment one" in line for line in lines] == [True, True]

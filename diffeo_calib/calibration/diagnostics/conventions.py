@@ -32,6 +32,8 @@ PROMISING = 0.02  # share of the spread that is left in an affine frame by what 
 NICE, KEEPS = 0.015, 3.0
 SMALLEST_LIMIT = 0.001  # of the share that a convention may leave: rows that the robot explains need none
 LEAST_PART, MOST_PART = 0.04, 2.2  # of a joint's limits, within which its values lie in the right unit
+TURNS, MOST_TURNS = 4, 1.5  # number of their factor among all, and turns up to which values may be turns
+SLACK, MOST_BEYOND = 0.02, 0.02  # rad or m by which values may be beyond limits, and share of rows that may be
 LARGEST_PERCENT = 101.0  # from which values are not -100..100 or 0..100 of the limits
 RATIOS = sorted(range(2, 401), key=lambda ratio: (ratio % 10 > 0, ratio % 5 > 0))  # of gears, the usual ones first
 RIGHT_ANGLES = {1.0: "+pi/2", -1.0: "-pi/2", 2.0: "+pi"}
@@ -83,7 +85,7 @@ def _term(value: float, name: str, angle: str) -> str:
     """A factor and its column: -360/4096*{name}."""
     turn, words = (360.0, "360") if angle == "deg" else (2 * pi, "2*pi")
     named = {1.0: "", 180 / pi: "180/pi*", pi / 180: "pi/180*"} | {1 / ratio: f"1/{ratio}*" for ratio in RATIOS}
-    named |= {turn / 2**k: f"{words}/{2**k}*" for k in range(8, 25)}
+    named |= {turn: f"{words}*"} | {turn / 2**k: f"{words}/{2**k}*" for k in range(8, 25)}
     text = next((text for size, text in named.items() if abs(size - abs(value)) < 1e-9 * size), f"{abs(value):.6g}*")
     return f"{'-' if value < 0.0 else '+'}{text}{{{name}}}" if value else ""
 
@@ -128,7 +130,14 @@ def conventions(
     good = sorted((judged(*candidate) for candidate in plain), key=lambda candidate: candidate.left)
     near = [candidate for candidate in good if candidate.left < min(limit, KEEPS * good[0].left)]
     least = min((candidate.cost for candidate in near), default=0)
-    return [candidate for candidate in near if candidate.cost == least and least]
+    plainest = [candidate for candidate in near if candidate.cost == least and least]
+    (low, high), beyond = robot.limits.to(data.q).mT, list[int]()
+    for way in plainest:
+        q = data.q @ way.matrix.mT + way.offset
+        q = q - robot.whole_turns(q)
+        beyond.append(int(((q < low - SLACK) | (q > high + SLACK)).sum()))
+    most = min(beyond, default=0) + MOST_BEYOND * len(data)  # the limits tell apart what the rows do not
+    return [way for way, count in zip(plainest, beyond, strict=True) if count <= most]
 
 
 class _Starts(NamedTuple):
@@ -161,8 +170,8 @@ class _Search:
         # (n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]
         self.room = torch.where(bounded, limits, torch.cat([-half, half], 1))
         self.width = self.room[:, 1] - self.room[:, 0]
-        # -100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read
-        ticks = [2 * pi / 2**k * per_rad for k in range(8, 25)]
+        # -100..100 and 0..100 of the limits, degrees, radians, turns and ticks as factors (n,) of the values as read
+        ticks = [2 * pi / 2**k * per_rad for k in (0, *range(8, 25))]
         plain = [value * torch.ones_like(self.width) for value in (pi / 180, 180 / pi, *ticks)]
         self.factors = [self.width / 200.0 * per_rad, self.width / 100.0 * per_rad, *plain]
 
@@ -185,10 +194,11 @@ class _Search:
             yield _Starts.joined(mixed)
         strange = bool((large | small | ~turning).all())
         percent = bool(((self.q * self.per_rad)[:, turning].abs() <= LARGEST_PERCENT).all())
+        turns = bool(((self.q * self.per_rad)[:, turning].abs() <= MOST_TURNS).all())
         moving = turning & (span > gates.FIXED_RANGE)
         for number, factor in enumerate(self.factors if bool(turning.any()) else ()):
             part = (factor * span / width)[moving]
-            possible = strange or (percent and number < 2)
+            possible = strange or (percent and number < 2) or (turns and number == TURNS)
             if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
                 starts = self.starts(torch.where(turning, factor, 1.0)[:, None] * identity, self.zeros(ZEROS // 2))
                 yield starts._replace(scaled=(moving & (number < 2)).expand_as(starts.offset))  # limits are rough

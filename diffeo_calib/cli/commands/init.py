@@ -284,15 +284,19 @@ def _commanded(robot: Path | None, sheet: guesses.Sheet) -> proposals.Source | N
     """The table as poses of the machine; None where a robot is named whose joints the table has."""
     if robot is None:
         return commanded(sheet)
+    refused = None
     try:
-        _arms(robot, sheet)
+        if any(arm.columns.how != guesses.BY_NO_NAME for arm in _arms(robot, sheet)):
+            return None
     except InputError as error:
-        try:
-            source = commanded(sheet)
-        except DiffeoCalibError:
-            raise error from None
-        return source.remarking(f"{robot}: not used, no column is named after its joints")
-    return None
+        refused = error
+    try:
+        source = commanded(sheet)
+    except DiffeoCalibError:
+        if refused is None:
+            return None
+        raise refused from None
+    return source.remarking(f"{robot}: not used, no column is named after its joints")
 
 
 def _of_robot(robot: Path, sheet: guesses.Sheet) -> proposals.Source:
@@ -426,6 +430,10 @@ def _arms(robot: Path, sheet: guesses.Sheet) -> list[Arm]:
                 arm = Arm(options, joints[:count], ends, guessed[0], tuple(lacking if count < len(joints) else ()))
                 arms.append(arm if options.base is None and count == len(joints) else arm.first(count))
                 break
+    if all(len(arm.joints) <= len(arm.lacking) for arm in arms):
+        every = [(*each, sheet.others(len(each[1]))) for each in whole]
+        unnamed = [Arm(options, joints, ends, others[0]) for options, joints, ends, others in every if others]
+        arms = [arm if arm.links.base is None else arm.first(len(arm.joints)) for arm in unnamed] or arms
     if not arms:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
         expected = " or ".join(dict.fromkeys(few(joints, 20) for joints in longest if joints)) or "a robot with joints"
