@@ -2,8 +2,11 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from init_bank import NAMES, XYZ, Proposed, rows
 
 from diffeo_calib.cli.guesses import Body, bodies_in, guess_deviations, guess_joints, joints_without_column
 
@@ -146,3 +149,31 @@ def test_joints_of_a_maker_are_found_beside_their_speeds(maker: str) -> None:
     columns = [*MAKERS[maker], *(f"d{name}" for name in own), *places]
     assert guess_joints(columns, ["q1", "q2"] if maker.startswith("ROS") else joints)[0].names == own
     assert [one.place for one in bodies_in(columns)] == [places]
+
+
+WORDS = ["Drehteller", "Schulter", "alpha", "beta", "gamma", "Flansch"]
+AWAY = torch.tensor([[512345.0, 5412345.0, 312.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("names", "per_deg", "joints", "axes", "away"),
+    [
+        (WORDS, 1.0, ",".join(WORDS), XYZ, 0.0),
+        (NAMES, 1.0, ",".join(NAMES), ["E", "N", "H"], 0.0),
+        (NAMES, 1.0, ",".join(NAMES), ["Easting", "Northing", "Height"], AWAY),
+        pytest.param(
+            *(NAMES, 1 / 360, ",".join(f"2*pi*{{{name}}}" for name in NAMES), XYZ, 0.0),
+            marks=pytest.mark.slow,
+            id="turns",
+        ),
+    ],
+)
+def test_other_names_places_and_turns(
+    names: list[str], per_deg: float, joints: str, axes: list[str], *, away: Any, proposed: Proposed
+) -> None:
+    """All other columns are the joints if there are as many; places of a survey are far from zero."""
+    q, points = rows()
+    found, text = proposed((names, per_deg * q), (axes, 1e-3 * points + away))
+    assert (found["joints"], found["length"], found["position"]) == (joints, "m", [",".join(axes)])
+    assert "all columns are used" in text
+    assert "look like millimetres" not in text

@@ -290,34 +290,6 @@ def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path
     assert '# length = "mm"  # the robot explains the rows in each' in text
 
 
-WORDS = ["Drehteller", "Schulter", "alpha", "beta", "gamma", "Flansch"]
-AWAY = torch.tensor([[512345.0, 5412345.0, 312.0]], dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("names", "per_deg", "joints", "axes", "away"),
-    [
-        (WORDS, 1.0, ",".join(WORDS), XYZ, 0.0),
-        (NAMES, 1.0, ",".join(NAMES), ["E", "N", "H"], 0.0),
-        (NAMES, 1.0, ",".join(NAMES), ["Easting", "Northing", "Height"], AWAY),
-        pytest.param(
-            *(NAMES, 1 / 360, ",".join(f"2*pi*{{{name}}}" for name in NAMES), XYZ, 0.0),
-            marks=pytest.mark.slow,
-            id="turns",
-        ),
-    ],
-)
-def test_other_names_places_and_turns(
-    names: list[str], per_deg: float, joints: str, axes: list[str], *, away: Any, proposed: Proposed
-) -> None:
-    """All other columns are the joints if there are as many; places of a survey are far from zero."""
-    q, points = rows()
-    found, text = proposed((names, per_deg * q), (axes, 1e-3 * points + away))
-    assert (found["joints"], found["length"], found["position"]) == (joints, "m", [",".join(axes)])
-    assert "all columns are used" in text
-    assert "look like millimetres" not in text
-
-
 @pytest.mark.slow
 def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
     q, points = rows()
