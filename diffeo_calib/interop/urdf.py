@@ -72,7 +72,8 @@ def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
     if robot is None:
         if chain.source is None:
             what = f"the model of robot '{chain.name}' does not hold the URDF that it was fitted with"
-            raise InputError.of(what, fix="pass the file: `robot`, or --robot URDF")
+            fix = "pass the file: `robot`, or --robot URDF; for a robot of a DH table write --dh, --mjcf or --c"
+            raise InputError.of(what, fix=fix)
         return chain.source.encode("utf-8", "surrogateescape")
     path = Path(robot)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)

@@ -455,7 +455,7 @@ def test_what_cannot_be_drawn_is_one_sentence(robot: Chain) -> None:
         ("`seed`", drawn(seed=-1)),
         ("`direction` of the tracker", lambda: dc.Tracker((1, 0, 0), direction=(0, 0, 0))),
         ("`half_angle` of the tracker", lambda: dc.Tracker((1, 0, 0), half_angle=4.0)),
-        ("joint 'slide' has no limits", lambda: dc.candidates(sliding_robot(), 3)),
+        ("joint 'slide' has no limits.*--range slide=LOWER:UPPER", lambda: dc.candidates(sliding_robot(), 3)),
         (r"a dc\.Tree", lambda: dc.candidates("robot", 3)),  # pyright: ignore[reportArgumentType]
     )
 

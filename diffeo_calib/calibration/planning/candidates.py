@@ -245,7 +245,7 @@ def _given(name: str, ends: object, limits: Sequence[float]) -> tuple[float, flo
 def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, float]:
     """The limits of a joint, or one turn of them."""
     if not turns and not (isfinite(lower) and isfinite(upper)):
-        fix = f"pass ranges={{'{name}': (lower, upper)}} in m"
+        fix = f"pass ranges={{'{name}': (lower, upper)}} in m, or --range {name}=LOWER:UPPER"
         raise InputError.of(f"the prismatic joint '{name}' has no limits", fix=fix)
     if not turns or upper - lower <= TURN:
         return lower, upper
