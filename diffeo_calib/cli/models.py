@@ -254,14 +254,15 @@ def motion_lines(motion: Registration, tips: Sequence[str], *, doubt: str = "") 
             sure = f" (unmoved with probability {motion.same_place:.2f})" if motion.same_place is not None else ""
             yield f"  that is {largest:.3f} mm from where it was{sure * (not doubt)}"
     if doubt:
-        yield f"  these places were found as if the robot had not changed{doubt}"
+        yield f"  these places, and how well they are known, are those of a robot that has not changed{doubt}"
 
 
-def frame_lines(motion: Registration) -> Iterator[str]:
-    """Where the measuring frame is now."""
+def frame_lines(motion: Registration, doubt: str = "") -> Iterator[str]:
+    """Where the measuring frame is now; ``doubt`` as of :func:`motion_lines`."""
     yield f"the measuring frame of the model, seen from the new one: {transform_words(motion.transform)}"
     shift, turn = 1e3 * motion.frame_deviations[:3], torch.rad2deg(motion.frame_deviations[3:])
-    yield f"  known to {triple(shift, '.2g')} mm at the middle of the rows, and to {triple(turn, '.2g')} deg"
+    known = f"  known to {triple(shift, '.2g')} mm at the middle of the rows, and to {triple(turn, '.2g')} deg"
+    yield f"{known}, if the robot has not changed{doubt}" if doubt else known
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

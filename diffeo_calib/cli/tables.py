@@ -41,7 +41,9 @@ def table_format(units: Units) -> TableFormat:
 
     InputError for a unit that is neither typed nor kept with the model.
     """
-    length, angle = units.length, units.angle
+    length, angle, pose = units.length, units.angle, units.robot_pose
+    if angle is None and pose is not None and "=" not in pose:
+        angle = "deg"  # commanded places have no angles: it is that of what is printed
     if length is None or angle is None:
         missing = " and ".join(f"--{name}" for name in ("length", "angle") if getattr(units, name) is None)
         fix = "state the units of the table; a model that `fit` made knows those of its own"

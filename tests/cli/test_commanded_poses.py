@@ -22,6 +22,8 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.cli.commands import init as commanded_poses
 from diffeo_calib.cli.guesses import guess_sheet
+from diffeo_calib.cli.options import Units
+from diffeo_calib.cli.tables import table_format
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv import columns as joints
 from diffeo_calib.measurements.csv.columns import PoseColumns
@@ -315,6 +317,7 @@ def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any
     assert "Gravity" not in report
     alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
     command.ran("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
+    assert table_format(Units(length="mm", robot_pose="x,y,z")).angle == "deg"  # places have no angle to state
     assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     written = ["--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"]
     command.ran("export", tmp_path / "t.safetensors", *written)

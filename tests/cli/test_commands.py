@@ -176,11 +176,22 @@ def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Comman
     assert "no change was found" in compared.out
 
 
-def written(path: Path, q: Tensor) -> str:
-    robot = simulated(1)[0]
-    data = dc.Measurements(q, robot.true_points(q), joint_names=robot.nominal.joint_names, doubt=False)
+def written(path: Path, q: Tensor, offset: float = 0.0) -> str:
+    robot, moved = simulated(1)[0], q.clone()
+    moved[:, 2] += offset
+    data = dc.Measurements(q, robot.true_points(moved), joint_names=robot.nominal.joint_names, doubt=False)
     write_measurements(path, data, FORMAT, position=[POSITION.split(",")])
     return str(path)
+
+
+@pytest.mark.slow
+def test_the_frame_of_a_robot_that_has_changed(files: dict[str, str], tmp_path: Path, command: Command) -> None:
+    q, out = simulated(1)[0].sample(25, seed=5), ("-o", tmp_path / "new.safetensors")
+    for offset in (0.0, 3e-3):
+        table = written(tmp_path / "new.csv", q, offset)
+        done = command.ran("recalibrate", files["old.safetensors"], table, *TABLE, *out)
+        doubted = "deg, if the robot has not changed: a part of the change below is in this" in done.out
+        assert (doubted, "has changed by" in done.out) == (offset > 0.0, offset > 0.0)
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def run(given: RecalibrateOptions) -> None:
     entries |= {"rows_can_tell": result.changes.tested, "markers": result.marker, "files": {"model": given.output}}
     entries |= {"converged": result.fit.converged, "status": result.status}
     console.record.add(**change_entries(result.changes, result.hidden), **entries, **console.entries_by_kind(kinds))
-    frame = () if result.moved is None else models.frame_lines(result.moved)
+    frame = () if result.moved is None else models.frame_lines(result.moved, doubt(result.changes, "in this"))
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     console.say(*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden))
     console.say(result.fit.status, f"model: {given.output}")
