@@ -52,6 +52,15 @@ def numbers(pattern: str, text: str | None) -> list[float]:
     return [float(number) for number in found.groups()]
 
 
+@pytest.mark.parametrize(("scale", "said"), [(3e-3, False), (2e-2, True)])
+def test_axes_of_a_machine_of_slides_are_as_wrong_as_its_spindles(scale: float, said: bool) -> None:
+    q = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wrong = q * (1.0 + scale * tensor([1.0, -0.6, 0.8])) + 2e-4 * (6 * q.roll(1, 1)).sin() + normal(60, 3, size=2e-5)
+    _, texts = warned(dc.calibrate, dc.cartesian(q), dc.Measurements(q, wrong))
+    assert any("along x seems to differ by +2" in text for text in texts) is said
+    assert any("seems to differ" in text for text in texts) is said
+
+
 @cache
 def clean() -> tuple[dc.CalibrationResult, list[str]]:
     return lengths(dc.Measurements(*ARM.measure(ROWS, seed=1)))

@@ -11,6 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import deformation_bank
 import numpy as np
 import pytest
 import torch
@@ -25,8 +26,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning import plan as planning
 from diffeo_calib.calibration.planning.candidates import candidates, collision_free
-from diffeo_calib.calibration.planning.sensors import BoardImages, sensor_of
+from diffeo_calib.calibration.planning.sensors import BoardImages, Sensor, sensor_of
 from diffeo_calib.cameras.images import Images, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
@@ -458,6 +460,14 @@ def test_what_cannot_be_drawn_is_one_sentence(robot: Chain) -> None:
         ("joint 'slide' has no limits.*--range slide=LOWER:UPPER", lambda: dc.candidates(sliding_robot(), 3)),
         (r"a dc\.Tree", lambda: dc.candidates("robot", 3)),  # pyright: ignore[reportArgumentType]
     )
+
+
+def test_slides_without_limits_stay_where_they_were_measured() -> None:
+    model = deformation_bank.model_of(sliding_robot(), dc.RK4(1))
+    q = planning.drawn(model, [Sensor.positions()], 9, torch.zeros(1, 3))
+    measured = model.configurations[:, 2]
+    more = 0.5 * (measured.max() - measured.min())
+    assert bool(((q[:, 2] > measured.min() - more) & (q[:, 2] < measured.max() + more)).all())
 
 
 BAR = """<link name="{child}"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/>

@@ -142,12 +142,15 @@ def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
     def effects(motion: Tensor) -> Tensor:
         return data.slopes @ motion.flatten(1)[..., None]
 
-    yield Hypothesis("the size of the robot", effects(away), PERCENT, OF_ROBOT)
+    chain, q, ratio = geometry.chain, data.x - data.x.mean(0), {"unit": PERCENT, "usual": gates.USUAL_RATIO}
+    scale = {"unit": PERCENT} if any(chain.periodic) else ratio  # a machine of slides alone is as wrong as its spindles
+    yield Hypothesis("the size of the robot", effects(away), fix=OF_ROBOT, **scale)
     if not data.adrift:  # a device has axes
         eye = torch.eye(3, dtype=away.dtype, device=away.device)
         for axis, unit in zip("xyz", eye, strict=True):
-            yield Hypothesis(f"the scale of the measuring frame along {axis}", effects(away * unit), PERCENT, OF_AXIS)
-    chain, q, ratio = geometry.chain, data.x - data.x.mean(0), {"unit": PERCENT, "usual": gates.USUAL_RATIO}
+            yield Hypothesis(
+                f"the scale of the measuring frame along {axis}", effects(away * unit), fix=OF_AXIS, **scale
+            )
     for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
         if not turns and any(chain.periodic):  # a machine of slides alone is judged by the axes of its places
             along = data.jacobian[..., joint, None] * q[:, joint, None, None]

@@ -12,7 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
+from diffeo_calib.calibration.planning.candidates import (
+    Criterion,
+    Tracker,
+    all_of,
+    candidates,
+    check_limits,
+    ranges_around,
+)
 from diffeo_calib.calibration.planning.scene import Scene, followed, of_model, of_robot
 from diffeo_calib.calibration.planning.sensors import Options, Sensor, sensors_for
 from diffeo_calib.common.checks import check_count
@@ -274,10 +281,11 @@ def drawn(
         given: a robot, or a model of it. markers: (P, 3) in the frame of the tip, m; the ball last.
         keep, tracker, cell: as of :func:`candidates`; the reflector of the tracker is one of the markers.
     """
-    model = isinstance(given, CalibratedKinematics)
-    robot, base = (
-        (given.robot, given.geometry.base) if model else (given, torch.eye(4, dtype=torch.float64, device=HOST))
-    )
+    robot, base, ranges = given, torch.eye(4, dtype=torch.float64, device=HOST), dict[str, Any]()
+    if isinstance(given, CalibratedKinematics):
+        robot, base, ranges = given.robot, given.geometry.base, ranges_around(given.robot, given.configurations)
+        kept = zip(ranges.items(), robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
+        ranges = dict(ends for ends, turns, limited in kept if not (turns or limited))  # slides without limits
     reached = [sensor.reached(base) for sensor in sensors]
     groups = [(number, {}) for number in [reached.count({})] if number]
     groups += [(1, where) for where in reached if "keep" in where]
@@ -287,7 +295,8 @@ def drawn(
     for number, where in groups:
         marker = markers[-1] if "places" in where else markers.mean(0)
         device = None if tracker is None else replace(tracker, marker=marker.tolist())
-        how = cell | {"ranges": where.get("ranges", {}) | dict(cell.get("ranges") or {}), "places": where.get("places")}
+        within = ranges | where.get("ranges", {}) | dict(cell.get("ranges") or {})
+        how = cell | {"ranges": within, "places": where.get("places")}
         criteria = all_of([asked for asked in (where.get("keep"), keep) if asked is not None])
         draws.append(candidates(robot, -(-count * number // whole), tracker=device, ball=marker, keep=criteria, **how))
     return torch.cat(draws)
